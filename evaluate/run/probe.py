@@ -5,8 +5,9 @@ plays a few rollouts, with the workers and policies of the run, again after othe
 has its rules. It writes nothing: a run begins only without a leak.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from itertools import chain
 
 from robomme_interference_data.errors import (
     InterferenceError,
@@ -25,7 +26,20 @@ from robomme_interference_data.runtime.executor import WorkerPool
 from .config import RunConfig
 from .plan import WorkItem
 from .record import BROKEN, INDEPENDENT, NONDETERMINISTIC, Probe
-from .traces import LEAK_P, Difference, Play, Turn, Verdict, flips, judge, noise_p, rounds, sequence
+from .traces import (
+    LEAK_P,
+    Difference,
+    Event,
+    Part,
+    Play,
+    Turn,
+    Verdict,
+    flips,
+    judge,
+    noise_p,
+    rounds,
+    sequence,
+)
 from .worker import ProbeTask, RunContext
 
 _REPEATS = 3
@@ -58,34 +72,70 @@ def probe_run(
     found = Probe(INDEPENDENT, rollouts, len(turns), clients)
     note(f"probing for a state that survives a reset: {counted(len(turns), 'short rollout')}")
     try:
-        _, difference = judge(first := _play(run, pool, turns))
+        first = _play(run, pool, turns)
+        _, difference = judge(first)
         if difference is None:
             return found
         part = difference.event.part.value
         note(f"the {part} differs: {counted(_REPEATS * len(turns), 'more short rollout')}")
         repeats = _repeat(run, pool, turns, first)
-        verdict, repeated = judge([play for plays in repeats for play in plays])
-        difference = repeated or difference  # the first plays alone may differ: noise
-        if verdict is Verdict.LEAK:
-            raise _leak(difference, f"in each of {_REPEATS} repetitions")
+        difference = _judged(chain(*repeats)) or difference  # the first plays alone may differ
         more = rounds(items)
         note(f"the {part} is not deterministic: {counted(len(more), 'whole rollout')}")
         repeats += _repeat(run, pool, turns, repeats[-1])
         plays = _play(run, pool, more, fresh=False)
+        _judged(plays)
     except _BrokenError as error:
         return replace(found, verdict=BROKEN, error=str(error))
     p_value, (pairs, flipped) = noise_p(repeats, plays), flips(plays)
+    event = difference.event
     if p_value < LEAK_P:
-        raise _leak(difference, f"and more than noise explains, p = {p_value:.2g}")
+        raise _leak(
+            event,
+            "First actions or outcomes depend on the rollout before, more than by noise (p = "
+            f"{p_value:.2g}).",
+        )
     return replace(
         found,
         verdict=NONDETERMINISTIC,
         plays=(1 + len(repeats)) * len(turns) + len(plays),
-        part=difference.event.part.value,
-        step=difference.event.step,
+        part=event.part.value,
+        step=event.step,
         pairs=pairs,
         flips=flipped,
         p_value=p_value,
+    )
+
+
+def _judged(plays: Iterable[Play]) -> Difference | None:
+    """Return the first difference of plays, None without one; raise if a state survives."""
+    verdict, difference = judge([*plays])
+    if verdict is Verdict.LEAK and difference is not None:
+        event, first, second = difference.event, difference.first, difference.second
+        raise _leak(
+            event,
+            f"{first.turn.item} has another {_VALUES[event.part]} at step {event.step} "
+            f"{second.circumstances} than {first.circumstances}; repeated, both are the same.",
+        )
+    return difference
+
+
+_VALUES = {
+    Part.RETRIEVAL: "history",
+    Part.SIMULATOR: "observation",
+    Part.WRITER: "subgoal",
+    Part.POLICY: "action",
+}
+
+
+def _leak(event: Event, evidence: str) -> LeakError:
+    part = event.part.value
+    return LeakError(
+        f"the {part} keeps a state from one rollout to the next. {evidence}",
+        f"Let its reset clear what is left: see {_PAGE}. {named('no_probe')} runs all the "
+        "same, and is recorded.",
+        part=part,
+        step=event.step,
     )
 
 
@@ -132,18 +182,3 @@ def _play(
     if after is not None:
         first = replace(first, after=after.turn.label)
     return [first, *rest]
-
-
-def _leak(difference: Difference, evidence: str) -> LeakError:
-    event, first, second = difference.event, difference.first, difference.second
-    part = event.part.value
-    what = {"policy": "action", "simulator": "observation", "subgoal writer": "subgoal"}
-    return LeakError(
-        f"the {part} keeps a state from one rollout to the next. {first.turn.item} has another "
-        f"{what.get(part, 'history')} at step {event.step} {second.circumstances} than "
-        f"{first.circumstances}, {evidence}",
-        f"Clear what is left in its reset: see {_PAGE}. {named('no_probe', True)} runs all the "
-        "same, and is recorded.",
-        part=part,
-        step=event.step,
-    )

@@ -5,7 +5,8 @@ order: a state that survives a reset gives the same differences again, noise doe
 """
 
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from itertools import combinations
@@ -31,7 +32,7 @@ ENOUGH_ROLLOUTS = 120
 LEAK_P = 0.01
 """Largest p-value at which plays that are noisy show a leak."""
 
-_SHARE, _FEWEST, _MOST = 0.05, 4, 12
+_SHARE, _FEWEST, _MOST = 0.05, 4, 16
 """Of a noisy system: the share of a run's rollouts in `rounds`, and bounds of its rollouts."""
 
 
@@ -84,14 +85,15 @@ def sequence(items: Sequence[WorkItem], *, clients: int) -> tuple[Turn, ...]:
 
 
 def rounds(items: Sequence[WorkItem]) -> tuple[Turn, ...]:
-    """Return what is played of a noisy system: some rollouts, whole, in order, again, and backward.
+    """Return what is played of a noisy system, to the end: rollouts in order, twice, and backward.
 
-    So most are played twice after the same rollout and once after another one.
+    Backward twice, too: so most are played twice after the same rollout, and twice after another.
     """
     ordered = sorted(items, key=lambda item: hashlib.sha256(item.key.encode()).digest())
-    count = int(len(items) * _SHARE) // 3
-    chosen = [Turn(item, whole=True) for item in ordered[: min(max(count, _FEWEST), _MOST)]]
-    return (*chosen, *chosen, *reversed(chosen))
+    count = min(max(_FEWEST, int(len(items) * _SHARE) // 4), _MOST)
+    forward = [Turn(item, whole=True) for item in ordered[:count]]
+    backward = forward[::-1]
+    return (*forward, *forward, *backward, *backward)
 
 
 def _history_rank(item: WorkItem) -> tuple[object, ...]:
@@ -224,28 +226,30 @@ def judge(plays: Sequence[Play]) -> tuple[Verdict, Difference | None]:
     """Return what plays show, and the earliest difference that shows it.
 
     The values of a play follow either from all that its client did since it was new, or, in a
-    process or server that outlives its clients, from the play just before. If one of these explains
-    all differences, and is known from repeated plays, a state survives.
+    process or server that outlives its clients, from the play just before. If no two plays with
+    the same past differ, and two that do differ were both repeated, a state survives.
     """
     apart = _differences(plays)
     if not apart:
         return Verdict.INDEPENDENT, None
-    differing = {difference.first.turn.item for difference in apart}
-    pasts: tuple[Callable[[Play], object], ...] = (
-        lambda play: (play.turn.beside, play.past),
-        lambda play: (play.turn.beside, play.after),
-    )
-    for past in pasts:
-        repeated = {
-            a.turn.item
-            for a, b in combinations(plays, 2)
-            if a.turn.item == b.turn.item and past(a) == past(b)
-        }
+    for past in (_since_new, _just_before):
         explained = all(past(each.first) != past(each.second) for each in apart)
-        if explained and differing <= repeated:
-            return Verdict.LEAK, min(apart, key=_step)
-    unexplained = [each for each in apart if pasts[0](each.first) == pasts[0](each.second)]
-    return Verdict.NOISE, min(unexplained or apart, key=_step)
+        times = Counter(map(past, plays))
+        repeated = [
+            each for each in apart if min(times[past(each.first)], times[past(each.second)]) > 1
+        ]
+        if explained and repeated:
+            return Verdict.LEAK, min(repeated, key=_step)
+    same = [each for each in apart if _since_new(each.first) == _since_new(each.second)]
+    return Verdict.NOISE, min(same or apart, key=_step)
+
+
+def _since_new(play: Play) -> tuple[object, ...]:
+    return play.turn.item, play.turn.beside, play.past
+
+
+def _just_before(play: Play) -> tuple[object, ...]:
+    return play.turn.item, play.turn.beside, play.after
 
 
 def _step(difference: Difference) -> int:
@@ -272,8 +276,8 @@ def first_difference(first: Sequence[Event], second: Sequence[Event]) -> Event |
 
 
 def flips(plays: Sequence[Play]) -> tuple[int, int]:
-    """Return how many rollouts were played twice after the same one, and ended differently."""
-    pairs = [same for same, _ in _same_and_other(plays)]
+    """Return how many pairs of `rounds` were played after the same rollout, and how many flip."""
+    pairs = [pair for same in _same_predecessor(plays) for pair in same]
     return len(pairs), sum(first.status != second.status for first, second in pairs)
 
 
@@ -282,10 +286,9 @@ def noise_p(repeats: Sequence[Sequence[Play]], plays: Sequence[Play]) -> float:
 
     Each test supposes that the past has no effect. Then plays of a rollout may change places:
 
-    - of the first actions at two places of the `repeats`, the two halves that belong together are
-      rarely closest within;
-    - of three `plays`, two after the same rollout, these are closest in at most a third of the
-      rollouts, by their first actions and by their outcomes.
+    - the first actions at two places of the `repeats` are rarely closest within either place;
+    - of four `plays`, two after a rollout and two after another one, these pairs are the closest
+      in at most a third of the rollouts, by their first actions and by their outcomes.
 
     Args:
         repeats: The plays of a sequence, at least twice.
@@ -297,13 +300,15 @@ def noise_p(repeats: Sequence[Sequence[Play]], plays: Sequence[Play]) -> float:
         for first, second in combinations(places, 2)
         if first[0].turn.item == second[0].turn.item
     ]
-    triples = [(*same, other) for same, other in _same_and_other(plays) if other is not None]
+    fours = [same for same in _same_predecessor(plays) if len(same) == 2]
     for distance in (_action_distance, _outcome_distance):
-        closest = sum(
-            distance(a, b) < min(distance(a, other), distance(b, other)) for a, b, other in triples
-        )
-        if triples:
-            found.append(poisson_binomial(closest, [1 / 3] * len(triples)))
+        closest = 0
+        for (a, b), (c, d) in fours:
+            same = distance(a, b) + distance(c, d)
+            others = (distance(a, c) + distance(b, d), distance(a, d) + distance(b, c))
+            closest += same < min(others)
+        if fours:
+            found.append(poisson_binomial(closest, [1 / 3] * len(fours)))
     return min(1.0, len(found) * min(found))
 
 
@@ -323,16 +328,16 @@ def _halves_p(actions: Sequence[tuple[float, ...]]) -> float:
     return sum(value <= given for value in sums) / len(sums)
 
 
-def _same_and_other(plays: Sequence[Play]) -> Iterator[tuple[tuple[Play, Play], Play | None]]:
-    """Yield two plays of a rollout after the same one, and, if any, one after another one."""
-    known = [play for play in plays if play.after is not None]
-    for item in dict.fromkeys(play.turn.item for play in known):
-        own = [play for play in known if play.turn.item == item]
-        for first, second in combinations(own, 2):
-            if first.after == second.after:
-                others = (play for play in own if play.after != first.after)
-                yield (first, second), next(others, None)
-                break
+def _same_predecessor(plays: Sequence[Play]) -> list[list[tuple[Play, Play]]]:
+    """Return the pairs of plays after the same rollout, of each rollout."""
+    groups: dict[WorkItem, dict[str, list[Play]]] = {}
+    for play in plays:
+        if play.after is not None:
+            groups.setdefault(play.turn.item, {}).setdefault(play.after, []).append(play)
+    return [
+        [(group[0], group[1]) for group in own.values() if len(group) > 1]
+        for own in groups.values()
+    ]
 
 
 def _action_distance(first: Play, second: Play) -> float:
