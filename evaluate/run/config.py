@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from robomme_interference_data.constants import DEMONSTRATIONS, SPLITS
+from robomme_interference_data.constants import DEMONSTRATIONS, QUESTIONS, SPLITS
 from robomme_interference_data.errors import InvalidOptionError, named
 from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.sampling import MEMORY_FORM
@@ -218,7 +218,7 @@ class AskConfig(WorkConfig):
         help="Options of the model, such as max_tokens=64 or response_s=60.",
     )
 
-    simulator: ClassVar[str] = "questions"
+    simulator: ClassVar[str] = QUESTIONS
     """The simulator in their rows: they are not rollouts."""
 
     shift: ClassVar[str] = NO_SHIFT

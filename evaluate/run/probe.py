@@ -28,12 +28,12 @@ from .plan import WorkItem
 from .record import BROKEN, INDEPENDENT, NONDETERMINISTIC, Probe
 from .traces import (
     LEAK_P,
-    Difference,
     Event,
-    Part,
+    FirstDifference,
+    Origin,
+    PlannedPlay,
     Play,
-    Turn,
-    Verdict,
+    ProbeVerdict,
     flips,
     judge,
     noise_p,
@@ -107,10 +107,10 @@ def probe_run(
     )
 
 
-def _judged(plays: Iterable[Play]) -> Difference | None:
+def _judged(plays: Iterable[Play]) -> FirstDifference | None:
     """Return the first difference of plays, None without one; raise if a state survives."""
     verdict, difference = judge([*plays])
-    if verdict is Verdict.LEAK and difference is not None:
+    if verdict is ProbeVerdict.LEAK and difference is not None:
         event, first, second = difference.event, difference.first, difference.second
         raise _leak(
             event,
@@ -121,10 +121,10 @@ def _judged(plays: Iterable[Play]) -> Difference | None:
 
 
 _VALUES = {
-    Part.RETRIEVAL: "history",
-    Part.SIMULATOR: "observation",
-    Part.WRITER: "subgoal",
-    Part.POLICY: "action",
+    Origin.RETRIEVAL: "history",
+    Origin.SIMULATOR: "observation",
+    Origin.WRITER: "subgoal",
+    Origin.POLICY: "action",
 }
 
 
@@ -140,7 +140,7 @@ def _leak(event: Event, evidence: str) -> LeakError:
 
 
 def _repeat(
-    run: RunContext[RunConfig], pool: WorkerPool, turns: tuple[Turn, ...], last: list[Play]
+    run: RunContext[RunConfig], pool: WorkerPool, turns: tuple[PlannedPlay, ...], last: list[Play]
 ) -> list[list[Play]]:
     """Play a sequence several times, each time with a new policy; `last` was played before."""
     repeats = [last]
@@ -163,7 +163,7 @@ class _BrokenError(Exception):
 def _play(
     run: RunContext[RunConfig],
     pool: WorkerPool,
-    turns: tuple[Turn, ...],
+    turns: tuple[PlannedPlay, ...],
     *,
     after: Play | None = None,
     fresh: bool = True,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.constants import MAX_ROW_BYTES
+from robomme_interference_data.constants import MAX_ROW_BYTES, QUESTIONS
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.stats.intervals import wilson
@@ -156,6 +156,18 @@ class RunHeader:
     def items(self) -> tuple[WorkItem, ...]:
         """All planned rollouts, each once, in canonical order."""
         return tuple(sorted({item for plan in self.plans for item in plan.items()}))
+
+    @property
+    def probed(self) -> str | None:
+        """What the probe found, in a sentence; None for questions, which are not probed."""
+        return None if self.identity.get("simulator") == QUESTIONS else probe_text(self.probe)
+
+    @property
+    def probe_note(self) -> str | None:
+        """A sentence for readers of scores, if the probe found anything but independence."""
+        if self.probe is None or self.probe.verdict == INDEPENDENT:
+            return None
+        return f"Leak probe of {self.identity.get('system')}: {probe_text(self.probe)}."
 
 
 def whole_lines(record: Path) -> bytes:

@@ -40,7 +40,7 @@ _SHARE, _FEWEST, _MOST = 0.05, 4, 16
 
 
 @dataclass(frozen=True)
-class Turn:
+class PlannedPlay:
     """A rollout that the probe plays.
 
     Attributes:
@@ -56,10 +56,11 @@ class Turn:
     @property
     def label(self) -> str:
         """The rollout, and how it is played."""
-        return self.item.key + ("" if self.whole else f" ({SHORT_STEPS} steps)")
+        beside = f", beside {self.beside.key}" if self.beside else ""
+        return self.item.key + ("" if self.whole else f" ({SHORT_STEPS} steps{beside})")
 
 
-def sequence(items: Sequence[WorkItem], *, clients: int) -> tuple[Turn, ...]:
+def sequence(items: Sequence[WorkItem], *, clients: int) -> tuple[PlannedPlay, ...]:
     """Return what the probe plays, in this order, with one policy; each time with the same past.
 
     The first rollout comes with a new policy, and after another rollout, which has the longest
@@ -76,22 +77,22 @@ def sequence(items: Sequence[WorkItem], *, clients: int) -> tuple[Turn, ...]:
     others = [item for item in ordered if item.episode.family != first.episode.family]
     others = others or [item for item in ordered if item.episode != first.episode] or [*ordered]
     second = max(others, key=_history_rank)
-    turns = [Turn(first), Turn(second), Turn(first)]
+    turns = [PlannedPlay(first), PlannedPlay(second), PlannedPlay(first)]
     if len(items) >= ENOUGH_ROLLOUTS:
-        turns += [Turn(second, whole=True), Turn(first)]
+        turns += [PlannedPlay(second, whole=True), PlannedPlay(first)]
     if clients > 1:
-        turns.append(Turn(second, beside=first))
+        turns.append(PlannedPlay(second, beside=first))
     return tuple(turns)
 
 
-def rounds(items: Sequence[WorkItem]) -> tuple[Turn, ...]:
+def rounds(items: Sequence[WorkItem]) -> tuple[PlannedPlay, ...]:
     """Return what is played of a noisy system, to the end: rollouts in order, twice, and backward.
 
     Backward twice, too: so most are played twice after the same rollout, and twice after another.
     """
     ordered = sorted(items, key=lambda item: hashlib.sha256(item.key.encode()).digest())
     count = min(max(_FEWEST, int(len(items) * _SHARE) // 4), _MOST)
-    forward = [Turn(item, whole=True) for item in ordered[:count]]
+    forward = [PlannedPlay(item, whole=True) for item in ordered[:count]]
     backward = forward[::-1]
     return (*forward, *forward, *backward, *backward)
 
@@ -107,7 +108,7 @@ def _rank(condition: str) -> tuple[object, ...]:
 # --- what is compared --------------------------------------------------------------------------
 
 
-class Part(Enum):
+class Origin(Enum):
     """What gives the values of a rollout."""
 
     RETRIEVAL = "retrieval step"
@@ -119,7 +120,7 @@ class Part(Enum):
 class Event(NamedTuple):
     """A value in a rollout: what gave it, after how many steps, and a digest of it."""
 
-    part: Part
+    part: Origin
     step: int
     digest: bytes
 
@@ -142,27 +143,27 @@ class Trace:
 
     def received(self, frames: Sequence[int]) -> None:
         """Add which frames of the history the policy receives."""
-        self._add(Part.RETRIEVAL, 0, np.array(frames, np.int64))
+        self._add(Origin.RETRIEVAL, 0, np.array(frames, np.int64))
 
     def observed(self, step: int, observation: Observation) -> None:
         """Add an observation of the simulator."""
         images = [observation.images[name] for name in sorted(observation.images)]
-        self._add(Part.SIMULATOR, step, *images, observation.state)
+        self._add(Origin.SIMULATOR, step, *images, observation.state)
 
     def told(self, step: int, subgoal: Subgoal) -> None:
         """Add a subgoal."""
-        self._add(Part.WRITER, step, np.frombuffer(subgoal.grounded.encode(), np.uint8))
+        self._add(Origin.WRITER, step, np.frombuffer(subgoal.grounded.encode(), np.uint8))
 
     def acted(self, step: int, action: NDArray[np.float32]) -> None:
         """Add an action of the policy."""
         self.first_action = self.first_action or tuple(action.tolist())
-        self._add(Part.POLICY, step, action)
+        self._add(Origin.POLICY, step, action)
 
     def ended(self, step: int, status: str) -> None:
         """Add how the simulator ended the rollout."""
-        self._add(Part.SIMULATOR, step, np.frombuffer(status.encode(), np.uint8))
+        self._add(Origin.SIMULATOR, step, np.frombuffer(status.encode(), np.uint8))
 
-    def _add(self, part: Part, step: int, *arrays: NDArray[Any]) -> None:
+    def _add(self, part: Origin, step: int, *arrays: NDArray[Any]) -> None:
         if not self.collects:
             return
         digest = hashlib.sha256()
@@ -185,7 +186,7 @@ class Play:
         status: How it ended; None if it was cut short.
     """
 
-    turn: Turn
+    turn: PlannedPlay
     past: tuple[str, ...]
     after: str | None
     events: tuple[Event, ...]
@@ -200,7 +201,7 @@ class Play:
         return before + (f", while another client plays {beside.key}" if beside else "")
 
 
-class Verdict(Enum):
+class ProbeVerdict(Enum):
     """What plays show."""
 
     INDEPENDENT = "independent"
@@ -214,7 +215,7 @@ class Verdict(Enum):
 
 
 @dataclass(frozen=True)
-class Difference:
+class FirstDifference:
     """The first value in which two plays of a rollout differ."""
 
     event: Event
@@ -222,7 +223,7 @@ class Difference:
     second: Play
 
 
-def judge(plays: Sequence[Play]) -> tuple[Verdict, Difference | None]:
+def judge(plays: Sequence[Play]) -> tuple[ProbeVerdict, FirstDifference | None]:
     """Return what plays show, and the earliest difference that shows it.
 
     The values of a play follow either from all that its client did since it was new, or, in a
@@ -231,7 +232,7 @@ def judge(plays: Sequence[Play]) -> tuple[Verdict, Difference | None]:
     """
     apart = _differences(plays)
     if not apart:
-        return Verdict.INDEPENDENT, None
+        return ProbeVerdict.INDEPENDENT, None
     for past in (_since_new, _just_before):
         explained = all(past(each.first) != past(each.second) for each in apart)
         times = Counter(map(past, plays))
@@ -239,9 +240,9 @@ def judge(plays: Sequence[Play]) -> tuple[Verdict, Difference | None]:
             each for each in apart if min(times[past(each.first)], times[past(each.second)]) > 1
         ]
         if explained and repeated:
-            return Verdict.LEAK, min(repeated, key=_step)
+            return ProbeVerdict.LEAK, min(repeated, key=_step)
     same = [each for each in apart if _since_new(each.first) == _since_new(each.second)]
-    return Verdict.NOISE, min(same or apart, key=_step)
+    return ProbeVerdict.NOISE, min(same or apart, key=_step)
 
 
 def _since_new(play: Play) -> tuple[object, ...]:
@@ -252,18 +253,18 @@ def _just_before(play: Play) -> tuple[object, ...]:
     return play.turn.item, play.turn.beside, play.after
 
 
-def _step(difference: Difference) -> int:
+def _step(difference: FirstDifference) -> int:
     return difference.event.step
 
 
-def _differences(plays: Sequence[Play]) -> list[Difference]:
+def _differences(plays: Sequence[Play]) -> list[FirstDifference]:
     """Return the first difference of each two plays of a rollout that differ."""
     found = []
     for first, second in combinations(plays, 2):
         if first.turn.item == second.turn.item:
             event = first_difference(first.events, second.events)
             if event is not None:
-                found.append(Difference(event, first, second))
+                found.append(FirstDifference(event, first, second))
     return found
 
 
@@ -316,16 +317,13 @@ def _halves_p(actions: Sequence[tuple[float, ...]]) -> float:
     """Return the share of divisions into halves that are as close within as the given one."""
     vectors = np.array(actions)
     distances = np.abs(vectors[:, None] - vectors[None]).max(axis=2)
-    half = len(actions) // 2
-
-    def within(chosen: tuple[int, ...]) -> float:
-        rest = [place for place in range(len(actions)) if place not in chosen]
-        return float(sum(distances[np.ix_(part, part)].sum() for part in (chosen, rest)))
-
-    given = within(tuple(range(half)))
-    # Either half of a division names it: only that with the first play is counted.
-    sums = [within((0, *others)) for others in combinations(range(1, len(actions)), half - 1)]
-    return sum(value <= given for value in sums) / len(sums)
+    # Either half of a division names it: here that with the first play.
+    count = len(actions)
+    chosen = [(0, *others) for others in combinations(range(1, count), count // 2 - 1)]
+    halves = np.array([[place in half for place in range(count)] for half in chosen])
+    sums = sum(((half @ distances) * half).sum(axis=1) for half in (halves, ~halves))
+    # The given one comes first.
+    return float(np.mean(sums <= sums[0]))
 
 
 def _same_predecessor(plays: Sequence[Play]) -> list[list[tuple[Play, Play]]]:

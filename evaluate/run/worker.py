@@ -23,7 +23,7 @@ from .config import AskConfig, RetrievalConfig, RunConfig
 from .history import HistoryReader
 from .plan import RunPlan, WorkItem
 from .row import Rollout
-from .traces import Turn
+from .traces import PlannedPlay
 
 if TYPE_CHECKING:
     from robomme_interference_data.retrieval.selector import Selector
@@ -128,7 +128,7 @@ class ProbeTask:
     """
 
     run: RunContext[RunConfig]
-    turns: tuple[Turn, ...]
+    turns: tuple[PlannedPlay, ...]
     fresh: bool
 
 

@@ -1,10 +1,9 @@
-"""Policies, simulators and servers that keep what a reset should clear; and noisy ones."""
+"""Policies and a simulator that keep what a reset should clear; and noisy ones."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
-from support.policy_server import Memory
 from support.worlds import World
 
 from robomme_interference_data.evaluate import BatchPolicy, Observation
@@ -87,26 +86,3 @@ class LeakyWorld(World):
         state[0] += self.left
         self.left = np.float32(self.answer[0] / 1000)
         return lesson, Observation(first.images, state), info
-
-
-class RetraceMemory(Memory):
-    """A server that retraces, and whose reset may clear nothing."""
-
-    def __init__(self, clears: bool):
-        self.clears, self.path = clears, list[Any]()
-        super().__init__()
-
-    def reset(self) -> None:
-        super().reset()
-        if self.clears:
-            self.path.clear()
-
-    def add_buffer(self, message: dict[str, Any]) -> None:
-        super().add_buffer(message)
-        if message["exec_start_idx"] > 0:
-            self.path += list(message["state"])
-
-    def answer(self, message: dict[str, Any]) -> dict[str, Any]:
-        answer = super().answer(message)
-        chunk, self.path[:16] = self.path[:16], []
-        return answer | ({"actions": np.stack(chunk)} if chunk else {})
