@@ -65,6 +65,7 @@ class RunResult:
         planned: Number of planned rollouts.
         counts: Number of rows by status.
         stopped: Why the run ended early, or None.
+        probe: What the leak probe found, now or earlier; None if the run was not probed.
     """
 
     folder: Path
@@ -72,6 +73,7 @@ class RunResult:
     planned: int
     counts: dict[str, int]
     stopped: str | None
+    probe: Probe | None
 
     def to_pandas(self) -> "pandas.DataFrame":
         """Return the rows as a pandas `DataFrame`; its columns are those of `rollouts.parquet`.
@@ -239,7 +241,7 @@ def _write_rows(
         if not disk_full:
             log.end(dataclasses.replace(log.header, invocations=(*earlier, last)))
     rows = tuple(log.rows[item] for item in items if item in log.rows)
-    return RunResult(log.folder, rows, len(items), count_statuses(rows), stopped)
+    return RunResult(log.folder, rows, len(items), count_statuses(rows), stopped, log.header.probe)
 
 
 def _outcomes(

@@ -45,7 +45,7 @@ from .worker import ProbeTask, RunContext
 _REPEATS = 3
 """How often all plays are repeated, in the same order and with a new policy, once two differ."""
 
-_PAGE = "docs/how-to/compare-systems.md"
+_PAGE = "docs/how-to/your-own-policy.md"
 
 
 def probe_run(
