@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.lazy import lazy
 from support.messages import raises
 from support.policy_server import PolicyServer, RetraceMemory
 from support.runs import header, run
@@ -37,6 +38,7 @@ from robomme_interference_data.evaluate.run.traces import (
 )
 from robomme_interference_data.ids import EpisodeId
 
+servers = lazy("support.vla_eval_servers")
 LEAKY = "python:support.leaky:"
 CONDITIONS = ("no-history", "k0", "k7")
 
@@ -289,3 +291,28 @@ def test_a_server_at_an_address_is_probed_too(tmp_path: Path, retracing: PolicyS
     found = probed(tmp_path / "run", retracing.url, policy_options=("checkpoint=a",))
     assert found["verdict"] == "independent"
     assert sum(call == {"call": "reset"} for call in retracing.calls) >= 9
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_two_clients_of_a_server_with_one_queue_are_a_leak(tmp_path: Path, shared: bool) -> None:
+    """LeRobot's `select_action` behind a server of vla-eval: all sessions take from one queue."""
+    queues = dict[str, list[Any]]()
+
+    def answer(obs: Any) -> Any:
+        queue = queues.setdefault("" if shared else obs["task_description"], [])
+        if obs.get("episode_restart"):
+            queue.clear()
+        if not queue:
+            queue.extend(np.append(obs["states"][:7] + step / 100, 1.0) for step in range(4))
+        return queue.pop(0)
+
+    server = servers.Noting({"send_state": True}, answer=answer)
+    options = {"policy_options": ("checkpoint=a",), "conditions": ("no-history",), "workers": 2}
+    with servers.running(server) as port:
+        policy = f"vla-eval:ws://127.0.0.1:{port}"
+        if shared:
+            with pytest.raises(LeakError) as raised:
+                probed(tmp_path / "run", policy, **options)
+            assert "while another client plays" in raised.value.message
+        else:
+            assert probed(tmp_path / "run", policy, **options)["clients"] == 2
