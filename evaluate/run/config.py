@@ -138,6 +138,7 @@ class RunConfig(WorkConfig):
         0.01,
         group=_EXECUTION,
         help="Maximum seconds that an idle shared policy waits for a larger batch.",
+        rare=True,
     )
     policy_resources: tuple[str, ...] = setting(
         (),
