@@ -68,6 +68,9 @@ class Clock:
     def __init__(self) -> None:
         self.times: list[float] = []
 
+    def note(self, text: str) -> None:
+        """Take what is said of the probe."""
+
     def start(self, items: Sequence[WorkItem], done: Sequence[Rollout]) -> None:
         """Take the plan."""
 
@@ -183,6 +186,7 @@ def seconds_a_rollout(
             families=families,
             episodes="0",
             workers=workers,
+            no_probe=True,
         )
         run_evaluation(config, progress=clock, executor=executor)
     counted = clock.times[workers - 1 :]  # most likely

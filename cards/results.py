@@ -203,6 +203,8 @@ def _provenance(scored: Score, run: RunHeader | None, table: Path) -> Provenance
                 rows.append((f"renderer of the {escape(images)}", code(renderer)))
         policy = run.identity.get("policy")
         rows.append(("policy", code(policy) if policy else "not recorded"))
+        if run.probed is not None:
+            rows.append(("leak probe", escape(run.probed)))
         for invocation in run.invocations[-1:]:
             rows += [("git", code(invocation.git))] if invocation.git else []
             versions = (

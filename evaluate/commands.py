@@ -64,6 +64,10 @@ def evaluate(config: RunConfig, as_json: AsJson = False) -> None:
     rollout, OUT/run.json the settings; tables are exported when the run ends. To resume an
     interrupted run, re-run the same command: it skips finished rollouts and repeats errors.
 
+    Before the first row, a probe repeats short rollouts after others. If policy, simulator or
+    subgoal writer keep a state, the run does not begin; if they are not deterministic, it
+    measures how many outcomes flip. OUT/run.json has what it found.
+
     With --offline there is no simulator: the policy acts along recorded executions, and rows have
     the difference of its actions to the recorded ones. The policies hold and mean fit any robot,
     as your own may.
@@ -114,6 +118,7 @@ def _run(config: RunConfig | AskConfig, kept: str, unit: str, *, as_json: bool) 
 
     from .run.evaluation import run_evaluation
     from .run.progress import RunProgress, error_table, rate_table
+    from .run.record import INDEPENDENT, probe_text
 
     check_output(config.out)
     offline = isinstance(config, RunConfig) and config.offline
@@ -123,6 +128,8 @@ def _run(config: RunConfig | AskConfig, kept: str, unit: str, *, as_json: bool) 
     ):
         result = run_evaluation(config, progress=shown, command=[command_line()])
     if as_json:
+        if result.probe is not None and result.probe.verdict != INDEPENDENT:
+            print_status(probe_text(result.probe))  # else it is printed before the rows
         print_json([to_dict(row) for row in result.rows])
     else:
         echo((error_table if offline else rate_table)(result.rows).text())

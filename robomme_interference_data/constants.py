@@ -189,6 +189,9 @@ FETCH_RECORD = f"{MANIFESTS}/fetched.json"
 OFFICIAL = "robomme"
 """The benchmark's own simulator, the source of the published recordings and results."""
 
+QUESTIONS = "questions"
+"""The simulator in the rows of answered questions."""
+
 RECORDINGS = "recordings"
 """Plays back executions for offline evaluation; a simulator in rows only, not one to choose."""
 

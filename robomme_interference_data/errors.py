@@ -243,6 +243,22 @@ class PolicyError(InterferenceError, RuntimeError):
     """
 
 
+class LeakError(InterferenceError, RuntimeError):
+    """A policy, simulator or subgoal writer that carries a state from one rollout to the next.
+
+    Fix: let its reset clear what is left: docs/how-to/your-own-policy.md.
+
+    Attributes:
+        part: What gave the first different value: `policy`, `simulator`, `subgoal writer` or
+            `retrieval step`.
+        step: Executed steps before it.
+    """
+
+    def __init__(self, message: str, hint: str | None = None, *, part: str = "", step: int = 0):
+        super().__init__(message, hint)
+        self.part, self.step = part, step
+
+
 class PolicyServerError(InterferenceError, ConnectionError):
     """A policy server that cannot be reached, reports an error, or does not answer in time.
 

@@ -1,17 +1,18 @@
 """One rollout: reset the episode, hand over the history of the condition, run the live loop."""
 
+import hashlib
 import time
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import ACTION_CHUNK, MAX_STEPS
+from robomme_interference_data.constants import ACTION_CHUNK
 from robomme_interference_data.data.buffer import Buffer, Chunk
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import InvalidOptionError, PolicyError, RunError
@@ -20,6 +21,7 @@ from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.history import HistoryReader, history_columns
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout, model_columns
+from robomme_interference_data.evaluate.run.traces import Trace
 from robomme_interference_data.evaluate.run.worker import RunContext
 from robomme_interference_data.evaluate.systems import check_history, name_system
 from robomme_interference_data.runtime.executor import Worker
@@ -68,8 +70,13 @@ def run_rollout(
     clip: "Clip | None" = None,
     worker: Worker | None = None,
     answer: int | None = None,
+    predecessor: str | None = None,
+    trace: Trace | None = None,
 ) -> Rollout:
-    """Run one rollout and return its row; `answer` is what the policy `answers` carries out.
+    """Run one rollout and return its row.
+
+    `answer` is what the policy `answers` carries out, `predecessor` the column of the row; `trace`
+    collects values, and may end the rollout early.
 
     The policy never sees the simulator's own playback: its history comes from the dataset.
     """
@@ -81,12 +88,14 @@ def run_rollout(
     cameras = policy.history_cameras if selector is None else ()
     buffer = buffer_set.load(item.episode, item.condition, cameras=cameras)
     received: Sequence[int] = range(len(buffer))
+    trace = trace or Trace(collects=False)
     limit = worker.limit(config.simulator_timeout_s, "the simulator's reset")
     with clock.part("reset_s"), limit:
         demonstration, first, info = simulator.reset(
             str(item.episode), demonstration=config.check_lesson
         )
     check_episode(buffer.query, demonstration, first, info)
+    trace.observed(0, first)
     if config.check_lesson:
         # Under a shift the first live view differs from the recorded one.
         check_lesson(buffer.query, demonstration, first, views=config.shift == NO_SHIFT)
@@ -95,6 +104,7 @@ def run_rollout(
             camera = buffer.query.dataset.camera(selector.camera)
             received = selector.select(buffer, first.images[camera]).tolist()
         check_history(name_system(run.system), {item.condition: len(received)})
+    trace.received(received)
     if clip is not None:
         clip.begin(buffer_set, buffer, received, first, info)
     rollout_info = RolloutInfo(info.goal, len(received), config.model_seed)
@@ -111,7 +121,7 @@ def run_rollout(
         with clock.part("model_s"):
             frames = HistoryFrames(buffer, received, reader)
             writer.start(frames, rollout_info, simulator)
-    live = _Live(run.config, policy, simulator, writer, clock, clip, worker)
+    live = _Live(run.config, policy, simulator, writer, clock, clip, worker, trace)
     try:
         status = live.run(first, info.goal)
         if status is Status.ERROR:
@@ -120,7 +130,12 @@ def run_rollout(
             )
     except Exception as error:
         # The executor hands this on with the error: columns of the error's row.
-        vars(error)["progress"] = {"steps": live.steps, **_model_columns(writer)}
+        vars(error)["progress"] = {
+            "steps": live.steps,
+            "actions_sha256": live.sent.hexdigest(),
+            "predecessor": predecessor,
+            **_model_columns(writer),
+        }
         raise
     memory = None if run.facts.memory is None else Memory.parse(run.facts.memory)
     times: dict[str, Any] = {name: round(value, 4) for name, value in clock.items()}
@@ -131,6 +146,8 @@ def run_rollout(
         difficulty=info.difficulty,
         goal=info.goal,
         steps=live.steps,
+        actions_sha256=live.sent.hexdigest(),
+        predecessor=predecessor,
         **history_columns(buffer, received, memory, retrieved=selector is not None),
         **_model_columns(writer),
         # A simulator of the user need not be a subclass.
@@ -142,7 +159,7 @@ def run_rollout(
 
 @dataclass
 class _Live:
-    """The live loop of one rollout; `steps` counts the executed ones."""
+    """The live loop of one rollout; `steps` counts the executed actions, `sent` digests them."""
 
     config: RunConfig
     policy: Policy
@@ -151,11 +168,13 @@ class _Live:
     clock: _Clock
     clip: "Clip | None"
     worker: Worker
+    trace: Trace
     steps: int = 0
+    sent: Any = field(default_factory=hashlib.sha256)
 
     def run(self, first: Observation, goal: str) -> Status:
-        """Return the final status."""
-        seen = [first]
+        """Return the final status; a timeout after the most steps of the trace."""
+        seen, most_steps = [first], self.trace.most_steps
         written: int | None = None  # steps before the current subgoal was written
         subgoal: Subgoal | None = None
         watches = self.writer is not None and self.writer.every_frame
@@ -171,23 +190,28 @@ class _Live:
                     self.writer.watch(seen)
                     if needs_subgoal:
                         subgoal, written = self.writer.next(seen[-1], self.steps), self.steps
+                        self.trace.told(self.steps, subgoal)
                 seen[-1] = replace(seen[-1], subgoal=subgoal)
-            actions = self._decide(seen, goal)[: MAX_STEPS - self.steps]
+            actions = self._decide(seen, goal)[: most_steps - self.steps]
             seen = []
             with self.worker.limit(self.config.simulator_timeout_s, "the simulator's steps"):
                 for number, action in enumerate(actions, 1):
                     needed = every_frame or number == len(actions)
                     drawn = needed or self.clip is not None
+                    self.sent.update(action.astype("<f4").tobytes())
+                    self.trace.acted(self.steps, action)
                     with self.clock.part("simulator_s"):
                         observed, status = self.simulator.step(action, observe=drawn)
                     self.steps += 1
                     if self.clip is not None:
                         self.clip.step(observed, status, subgoal)
                     if status is not Status.ONGOING:
+                        self.trace.ended(self.steps, status)
                         return status
-                    if self.steps >= MAX_STEPS:
+                    if self.steps >= most_steps:
                         return Status.TIMEOUT
                     if needed:
+                        self.trace.observed(self.steps, observed)
                         seen.append(observed)
 
     def _decide(self, seen: Sequence[Observation], goal: str) -> NDArray[np.float32]:

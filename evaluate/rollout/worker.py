@@ -2,11 +2,11 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from robomme_interference_data.constants import DEMONSTRATIONS
+from robomme_interference_data.constants import DEMONSTRATIONS, MAX_STEPS
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import (
     NoRendererError,
@@ -22,7 +22,8 @@ from robomme_interference_data.evaluate.policies.registry import make_policy, st
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout
-from robomme_interference_data.evaluate.run.worker import Job, RunFunction
+from robomme_interference_data.evaluate.run.traces import SHORT_STEPS, Play, Trace
+from robomme_interference_data.evaluate.run.worker import Job, ProbeTask, RunFunction
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.codec import to_dict
@@ -36,6 +37,7 @@ from robomme_interference_data.simulators.registry import (
 )
 
 from .checks import check_episode
+from .clients import Calls, Interleaved, Recorder
 from .rollout import run_rollout
 from .settings import simulator_options, used_cameras
 
@@ -87,16 +89,21 @@ class RolloutFunction(RunFunction[RunConfig]):
         self._answers, self._addresses, self._made_policy = answers, addresses, policy
         self._simulator: Simulator | None = None
         self._policy: Policy | None = None
+        self._past: list[str] = []  # labels of what the policy has played
         self._checked = False  # whether the policy's server is the one that the run began with
         self._writer: SubgoalWriter | None = None
         self._logs: dict[str, bytes] = {}
 
-    def work(self, task: Job[RunConfig] | StartServer | StartSimulator, worker: Worker) -> Any:
-        """Run a rollout; return its row, and a problem of its clip. Or start something."""
+    def work(
+        self, task: Job[RunConfig] | ProbeTask | StartServer | StartSimulator, worker: Worker
+    ) -> Any:
+        """Run a rollout; return its row, and a problem of its clip. Or probe, or start a part."""
         if isinstance(task, StartServer):
             return self._start_server(task.asks, worker)
         if isinstance(task, StartSimulator):
             return self._start_simulator(task.episode, worker)
+        if isinstance(task, ProbeTask):
+            return self._probe(task, worker)
         return self._run(task, worker)
 
     def describe(self) -> dict[str, str]:
@@ -113,6 +120,7 @@ class RolloutFunction(RunFunction[RunConfig]):
                 if resource is not None:
                     resource.close()
         self._policy = self._simulator = self._writer = None
+        self._past.clear()
 
     def _start_server(
         self, asks: bool, worker: Worker
@@ -157,33 +165,75 @@ class RolloutFunction(RunFunction[RunConfig]):
 
             clip = Clip(item, job.run.system, worker.folder)
         try:
-            row = self._roll(job, worker, clip)
+            row = self._roll(job, worker, clip=clip)
         except Exception as error:
             what = f"{type(error).__name__}: {first_line(error)}"
             self._send_files(item, worker, clip, Status.ERROR, what)
             if isinstance(error, ServerKeepaliveError):
                 logger.warning("%s: %s. It is started again, once.", item, error.message)
-            # If the server is gone, this worker must not break one rollout after the other: it
-            # retires, and workers with other servers do the rest. A server that workers start is
-            # started again instead.
-            if isinstance(error, PolicyServerError) and not starts_server(config.policy):
-                self.close()
-                self._check_reachable(worker)
+            self._check_reachable(error, worker)
             raise
         self._send_files(item, worker, clip, Status(row.status))
         return row, clip.problem if clip else None
 
-    def _roll(self, job: Job[RunConfig], worker: Worker, clip: Any) -> Rollout:
+    def _probe(self, task: ProbeTask, worker: Worker) -> list[Play]:
+        """Play rollouts one after the other, and return their values."""
+        if task.fresh and self._past:
+            self.close()
+        plays, calls = list[Play](), dict[WorkItem, Calls]()
+        for turn in task.turns:
+            trace = Trace(MAX_STEPS if turn.whole else SHORT_STEPS)
+            policy, past = self._open_policy(worker), tuple(self._past)
+            with ExitStack() as stack:
+                if turn.beside is not None:
+                    other = stack.enter_context(closing(self._make_policy(worker, client=1)))
+                    policy = Interleaved(policy, other, calls[turn.beside])
+                elif any(turn.item == later.beside for later in task.turns):
+                    policy = Recorder(policy, calls.setdefault(turn.item, []))
+                try:
+                    job = Job(turn.item, task.run)
+                    row = self._roll(job, worker, policy=policy, trace=trace, label=turn.label)
+                except Exception as error:
+                    self._check_reachable(error, worker)
+                    raise
+            ended = turn.whole or row.steps < SHORT_STEPS
+            plays.append(
+                Play(
+                    turn,
+                    past,
+                    plays[-1].turn.label if plays else None,
+                    tuple(trace.events),
+                    trace.first_action,
+                    row.status if ended else None,
+                )
+            )
+        self._logs.clear()
+        return plays
+
+    def _roll(
+        self,
+        job: Job[RunConfig],
+        worker: Worker,
+        *,
+        clip: Any = None,
+        policy: Policy | None = None,
+        trace: Trace | None = None,
+        label: str | None = None,
+    ) -> Rollout:
+        """Run a rollout; `policy` is the worker's own, or one around it."""
         if self._answers is not None and job.item not in self._answers:
             raise PolicyError(
                 f"the question of {job.item} broke: it has no answer",
                 "Resume the run of questions, then this one.",
             )
-        policy = self._open_policy(worker)
+        own = self._open_policy(worker)
+        policy = policy or own
         if not self._checked:
-            self._check_served(policy, job.run.metadata)
+            self._check_served(own, job.run.metadata)
             self._send_logs(worker)
             self._checked = True
+        predecessor = self._past[-1] if self._past else None
+        self._past.append(label or job.item.key)
         return run_rollout(
             job.run,
             job.item,
@@ -196,6 +246,8 @@ class RolloutFunction(RunFunction[RunConfig]):
             clip=clip,
             worker=worker,
             answer=(self._answers or {}).get(job.item),
+            predecessor=predecessor,
+            trace=trace,
         )
 
     def _check_served(self, policy: Policy, metadata: Mapping[str, Any]) -> None:
@@ -212,13 +264,20 @@ class RolloutFunction(RunFunction[RunConfig]):
                 "Serve the same checkpoint everywhere; on a cluster localhost is each node's own.",
             )
 
-    def _check_reachable(self, worker: Worker) -> None:
-        """Retire the worker if the policy's server cannot be reached."""
+    def _check_reachable(self, error: Exception, worker: Worker) -> None:
+        """Retire the worker if, after an error, the policy's server cannot be reached.
+
+        It must not break one rollout after the other: workers with other servers do the rest. A
+        server that workers start is started again instead.
+        """
+        if not isinstance(error, PolicyServerError) or starts_server(self.config.policy):
+            return
+        self.close()
         try:
             with closing(self._make_policy(worker)) as policy:
                 policy.metadata()  # connects
-        except PolicyServerError as error:
-            raise WorkerRetiredError(error.message, error.hint) from error
+        except PolicyServerError as gone:
+            raise WorkerRetiredError(gone.message, gone.hint) from gone
 
     def _send_files(
         self, item: WorkItem, worker: Worker, clip: Any, status: Status, error: str | None = None
@@ -253,7 +312,8 @@ class RolloutFunction(RunFunction[RunConfig]):
             self._checked = False
         return self._policy
 
-    def _make_policy(self, worker: Worker) -> Policy:
+    def _make_policy(self, worker: Worker, client: int = 0) -> Policy:
+        """Make the worker's policy, or another client of what that shares with other workers."""
         config = self.config
         if self._made_policy is not None:
             return self._made_policy
@@ -262,7 +322,8 @@ class RolloutFunction(RunFunction[RunConfig]):
         from robomme_interference_data.evaluate.policies.shared import SharedPolicy
 
         address = self._addresses[worker.number % len(self._addresses)]
-        return SharedPolicy.open(address, worker.number)
+        # Workers have numbers from 0, and whoever loads the policy has -1.
+        return SharedPolicy.open(address, -2 - worker.number if client else worker.number)
 
     def _open_simulator(self, policy: Policy, worker: Worker) -> Simulator:
         config = self.config

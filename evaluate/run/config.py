@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from robomme_interference_data.constants import DEMONSTRATIONS, SPLITS
+from robomme_interference_data.constants import DEMONSTRATIONS, QUESTIONS, SPLITS
 from robomme_interference_data.errors import InvalidOptionError, named
 from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.sampling import MEMORY_FORM
@@ -150,6 +150,7 @@ class RunConfig(WorkConfig):
         0.01,
         group=_EXECUTION,
         help="Maximum seconds that an idle shared policy waits for a larger batch.",
+        rare=True,
     )
     policy_resources: tuple[str, ...] = setting(
         (),
@@ -178,6 +179,9 @@ class RunConfig(WorkConfig):
         metavar="NAME=VALUE",
         group=_SUBGOALS,
         help="Options of the writer, such as frames=32 or response_s=60.",
+    )
+    no_probe: bool = setting(
+        False, group=_EXECUTION, help="Do not test before the run whether a state survives a reset."
     )
     videos: bool = setting(False, group=_EXECUTION, help="Write a video of each rollout.")
     check_lesson: bool = setting(
@@ -229,7 +233,7 @@ class AskConfig(WorkConfig):
         help="Options of the model, such as max_tokens=64 or response_s=60.",
     )
 
-    simulator: ClassVar[str] = "questions"
+    simulator: ClassVar[str] = QUESTIONS
     """The simulator in their rows: they are not rollouts."""
 
     shift: ClassVar[str] = NO_SHIFT

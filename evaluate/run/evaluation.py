@@ -5,9 +5,11 @@ A run has these steps, each of which takes values and returns values:
 1. settings: `run_evaluation` checks what rollouts and questions share;
 2. plan and workers: `open_rollouts` or `open_questions` identifies the policy or model, plans the
    run (`plan_run`), and opens workers for what is not finished;
-3. header: `open_log` creates the folder, or compares it with the run that it holds;
-4. rows: `_write_rows` writes each as it comes;
-5. close: workers end, tables are exported, and the header gets its status.
+3. folder: `open_log` creates it, or compares it with the run that it holds;
+4. probe: `probe_run` plays rollouts to find a state that survives a reset, then the header is
+   written;
+5. rows: `_write_rows` writes each as it comes;
+6. close: workers end, tables are exported, and the header gets its status.
 """
 
 import dataclasses
@@ -44,6 +46,7 @@ from .faults import error_text, first_fault, first_trace
 from .identity import invocation, now, plain, run_identity
 from .log import RunLog, count_statuses, open_log
 from .plan import WorkItem, shuffle_work
+from .record import Probe, probe_text
 from .row import Rollout, is_done, row_line, row_of
 from .worker import Job, PlannedRun, RunContext
 
@@ -61,6 +64,7 @@ class RunResult:
         planned: Number of planned rollouts.
         counts: Number of rows by status.
         stopped: Why the run ended early, or None.
+        probe: What the leak probe found, now or earlier; None if the run was not probed.
     """
 
     folder: Path
@@ -68,6 +72,7 @@ class RunResult:
     planned: int
     counts: dict[str, int]
     stopped: str | None
+    probe: Probe | None
 
     def to_pandas(self) -> "pandas.DataFrame":
         """Return the rows as a pandas `DataFrame`; its columns are those of `rollouts.parquet`.
@@ -80,6 +85,9 @@ class RunResult:
 
 class ProgressCallback(Protocol):
     """Shows the progress of a run."""
+
+    def note(self, text: str) -> None:
+        """Receive a sentence about the probe, before the plan."""
 
     def start(self, items: Sequence[WorkItem], done: Sequence[Rollout]) -> None:
         """Receive the plan, and the rows of earlier invocations."""
@@ -116,6 +124,7 @@ def run_evaluation(
         HashMismatchError: Its manifests or episode records do not have their recorded hashes.
         RunError: `out` holds another run, or other files.
         PolicyError: The policy cannot be made.
+        LeakError: A policy, simulator or subgoal writer keeps a state after a reset.
         PolicyServerError: No policy server can be reached, another run drives it, or it serves
             another kind of model than the system's.
         ModelError: The model cannot be reached, or does not exist.
@@ -142,7 +151,8 @@ def run_evaluation(
         log = stack.enter_context(
             open_log(folder, identity, buffer_set.name, resume=not config.no_resume)
         )
-        log.begin(invocation(run, plan, command))
+        probe = _probe(run, planned.items, pool, log, progress)
+        log.begin(invocation(run, plan, command), probe)
         # The buffer set may have moved to another folder: its label in rows stays the same.
         run = dataclasses.replace(run, buffer_set=log.header.buffer_set)
         callbacks = [] if progress is None else [progress]
@@ -166,6 +176,27 @@ def _open_run(
     from robomme_interference_data.evaluate.rollout.runner import open_rollouts
 
     return open_rollouts(config, buffer_set, executor)
+
+
+def _probe(
+    run: RunContext[Any],
+    items: Sequence[WorkItem],
+    pool: WorkerPool | None,
+    log: RunLog,
+    progress: ProgressCallback | None,
+) -> Probe | None:
+    """Probe a run of rollouts, once; None if it is not probed now."""
+    config, earlier = run.config, log.header.probe
+    if not isinstance(config, RunConfig) or config.no_probe or (earlier and earlier.done):
+        return None
+    if pool is None or all(item in log.rows and is_done(log.rows[item]) for item in items):
+        return None
+    from .probe import probe_run  # questions have none
+
+    note = (lambda text: None) if progress is None else progress.note
+    probe = probe_run(run, items, pool, note)
+    note(probe_text(probe))
+    return probe
 
 
 def _write_rows(
@@ -211,7 +242,7 @@ def _write_rows(
         if not disk_full:
             log.end(dataclasses.replace(log.header, invocations=(*earlier, last)))
     rows = tuple(log.rows[item] for item in items if item in log.rows)
-    return RunResult(log.folder, rows, len(items), count_statuses(rows), stopped)
+    return RunResult(log.folder, rows, len(items), count_statuses(rows), stopped, log.header.probe)
 
 
 def _outcomes(

@@ -27,7 +27,7 @@ from robomme_interference_data.storage.staging import file_lock
 from robomme_interference_data.storage.text import read_header
 
 from .plan import WorkItem
-from .record import Invocation, RunHeader, whole_lines
+from .record import Invocation, Probe, RunHeader, whole_lines
 from .row import Rollout, is_done, read_record, row_line
 
 ERRORS_LOG = "errors.log"
@@ -48,11 +48,16 @@ class RunLog:
     def __init__(self, folder: Path, header: RunHeader, rows: dict[WorkItem, Rollout]):
         self.folder, self.header, self.rows = folder, header, rows
 
-    def begin(self, start: Invocation) -> None:
-        """Record an invocation."""
+    def begin(self, start: Invocation, probe: Probe | None = None) -> None:
+        """Record an invocation, and what its probe found, if it was probed."""
         plans = self.header.plans
         plans += () if start.plan in plans else (start.plan,)
-        header = replace(self.header, plans=plans, invocations=(*self.header.invocations, start))
+        header = replace(
+            self.header,
+            plans=plans,
+            invocations=(*self.header.invocations, start),
+            probe=probe or self.header.probe,
+        )
         self._write_header(with_counts(header, self.rows, "running"))
 
     def append(self, row: Rollout, trace: str | None = None) -> None:
@@ -97,7 +102,10 @@ class RunLog:
 def open_log(
     folder: Path, identity: Mapping[str, Any], buffer_set: str, *, resume: bool = True
 ) -> Iterator[RunLog]:
-    """Open or create the folder of a run, and lock it; an existing run keeps its label."""
+    """Open or create the folder of a run, and lock it; an existing run keeps its label.
+
+    A new run has no header before it begins: if its probe finds a leak, another run may follow.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     existing = sorted(path.name for path in folder.iterdir() if not path.name.startswith("."))
     if existing == [RUN_RECORD] and not (folder / RUN_RECORD).stat().st_size:
@@ -114,9 +122,9 @@ def open_log(
     with file_lock(folder / ".lock", busy):
         if not existing:
             (folder / RUN_RECORD).touch()
-            header = RunHeader(FORMAT_VERSION, dict(identity), buffer_set)
-            write_json(folder / RUN_HEADER, to_dict(header))
-        elif not resume:
+            yield RunLog(folder, RunHeader(FORMAT_VERSION, dict(identity), buffer_set), {})
+            return
+        if not resume:
             raise RunError(
                 f"{folder} holds a run already",
                 f"Set another {named('out')}, or leave out {named('no_resume')}.",

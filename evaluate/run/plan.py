@@ -37,6 +37,11 @@ class WorkItem:
         return f"{self.episode} under {self.condition}"
 
     @property
+    def key(self) -> str:
+        """Its text in columns and files, such as `MoveCube/test/3 k7`."""
+        return f"{self.episode} {self.condition}"
+
+    @property
     def file_name(self) -> str:
         """Stem of the names of its own files, such as `MoveCube_test_3_k7`."""
         return f"{str(self.episode).replace('/', '_')}_{self.condition}"

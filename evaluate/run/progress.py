@@ -46,6 +46,10 @@ class RunProgress:
         if self._console.is_terminal:
             self._bar.__exit__(*exception)
 
+    def note(self, text: str) -> None:
+        """Print a sentence."""
+        self._console.print(text, markup=False)
+
     def start(self, items: Sequence[WorkItem], done: Sequence[Rollout]) -> None:
         """Show the plan, and the rows of earlier invocations."""
         self._planned = Counter((item.episode.family, item.condition) for item in items)

@@ -75,11 +75,23 @@ class ActionErrorColumns:
     ] = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class TraceColumns:
+    """What the policy did; None for a question."""
+
+    actions_sha256: Annotated[
+        str | None,
+        "SHA-256 of all executed actions, offline of all compared ones, in order: float32, "
+        "little-endian.",
+    ] = None
+
+
 # Each feature is one line here. A dataclass takes the fields of its last base first, so files have
 # the columns of these lines from the last to first.
 @dataclass(frozen=True, kw_only=True)
 class Rollout(
     Timing,
+    TraceColumns,
     ModelColumns,
     ActionErrorColumns,
     AnswerColumns,

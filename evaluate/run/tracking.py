@@ -108,6 +108,9 @@ class Tracking(AbstractContextManager["Tracking"]):
         if self._tracker is not None:
             self._attempt(self._tracker.finish)
 
+    def note(self, text: str) -> None:
+        """Send nothing."""
+
     def start(self, items: Sequence[WorkItem], done: Sequence[Rollout]) -> None:
         """Count the rows of earlier invocations."""
         for row in done:

@@ -112,6 +112,7 @@ def score(settings: Settings, draws: int = DRAWS) -> Score:
     compared, unpaired = _compared(simulated, draws)
     contrasts = correct(with_primary(compared, simulated))
     notes = [*rows.notes, *renderer_notes(rows.sources.values()), *unpaired]
+    notes += [run.probe_note for run in rows.sources.values() if run and run.probe_note]
     notes += [sentence for each in simulated if (sentence := repeat_noise(each))]
     notes += [sentence for each in simulated for sentence in _unknown_runs(each)]
     tables = [*_tables(outcomes, cells, contrasts, draws), cost_table(rows, cells)]

@@ -107,8 +107,13 @@ class OutcomeColumns:
 
 @dataclass(frozen=True, kw_only=True)
 class Timing:
-    """When a rollout ended, and how long its parts took."""
+    """After what a rollout ran, when it ended, and how long its parts took."""
 
+    predecessor: Annotated[
+        str | None,
+        "What the same policy did before, such as `MoveCube/test/3 k7`: of a policy that workers "
+        "share and of a server, over this worker's connection. None if it was new.",
+    ] = None
     reset_s: Annotated[float | None, "Seconds to reset the simulator."] = None
     history_s: Annotated[float | None, "Seconds to decode and deliver the history."] = None
     policy_s: Annotated[float | None, "Seconds in the policy."] = None

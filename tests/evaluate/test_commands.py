@@ -114,7 +114,7 @@ def test_errors_are_printed_with_the_command_to_resume(
 def test_a_full_disk_names_the_file_and_the_command_to_resume(
     tmp_path: Path, tiny_buffers: Path
 ) -> None:
-    line = f"evaluate {tiny_buffers} --policy {OWN}Filler {USUAL} --families MoveCube"
+    line = f"evaluate {tiny_buffers} --policy {OWN}Filler {USUAL} --families MoveCube --no-probe"
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         done = type_in(f"{line} --out {tmp_path / 'run'}")

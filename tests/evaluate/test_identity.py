@@ -47,7 +47,7 @@ FREE = {
         *("no_resume", "cache", "rollout_timeout_s", "max_errors", "track"),
     },
     RunConfig: {
-        *("out", "videos", "check_lesson", "simulator_timeout_s"),
+        *("out", "videos", "check_lesson", "simulator_timeout_s", "no_probe"),
         "history_chunk",
         *("policies", "max_batch_size", "batch_wait_timeout_s", "policy_resources"),
     },

@@ -28,7 +28,7 @@ ROWS = list(KNOWN.values())
 def test_golden_files(tmp_path: Path, name: str) -> None:
     out = tmp_path / name
     with open_log(out, HEADER.identity, HEADER.buffer_set) as log:
-        log.begin(HEADER.invocations[0])
+        log.begin(HEADER.invocations[0], HEADER.probe)
         for row in ROWS:
             log.append(row, trace="Traceback\n…" if row.error else None)
         log.end(log.header)

@@ -132,6 +132,29 @@ class Memoryless(Memory):
         return self.answer(message)
 
 
+class RetraceMemory(Memory):
+    """A server that retraces, and whose reset may clear nothing."""
+
+    def __init__(self, clears: bool):
+        self.clears, self.path = clears, list[np.ndarray]()
+        super().__init__()
+
+    def reset(self) -> None:
+        super().reset()
+        if self.clears:
+            self.path.clear()
+
+    def add_buffer(self, message: dict[str, Any]) -> None:
+        super().add_buffer(message)
+        if message["exec_start_idx"] > 0:
+            self.path += list(message["state"])
+
+    def answer(self, message: dict[str, Any]) -> dict[str, Any]:
+        answer = super().answer(message)
+        chunk, self.path[:16] = self.path[:16], []
+        return answer | ({"actions": np.stack(chunk).astype(np.float64)} if chunk else {})
+
+
 _WORDS = ("prompt", "simple_subgoal", "grounded_subgoal")
 
 

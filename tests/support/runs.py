@@ -37,6 +37,7 @@ def config(**changes: Any) -> RunConfig:
         "families": worlds.FAMILIES,
         "episodes": "0",
         "conditions": ("no-history", "k0"),
+        "no_probe": True,  # tests count rollouts and calls; `test_probe.py` has those of the probe
     }
     return RunConfig(**usual | changes)
 

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from support.policy_server import Memory, PolicyServer
+from support.policy_server import Memory, PolicyServer, RetraceMemory
 
 
 def command(*words: object) -> str:
@@ -25,8 +25,10 @@ def main() -> None:
     parser.add_argument("--pids", type=Path, help="where its process id is written")
     parser.add_argument("--dies", type=Path, help="ends at once when asked, until that is there")
     parser.add_argument("--differs", type=Path, help="says something else once that is there")
+    parser.add_argument("--leaks", action="store_true", help="retraces, and clears no history")
     given: Any = parser.parse_args()
-    server = PolicyServer(Memory(keep=False), port=given.port)
+    memory = RetraceMemory(clears=False) if given.leaks else Memory(keep=False)
+    server = PolicyServer(memory, port=given.port)
     server.metadata = json.loads(given.metadata)
     if given.differs is not None and given.differs.exists():
         server.metadata["checkpoint"] = "other"

@@ -8,8 +8,10 @@ import pytest
 from support.package import imported_modules
 from support.runs import untimed
 
-from robomme_interference_data.errors import NoRendererError
+from robomme_interference_data.errors import LeakError, NoRendererError
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
+from robomme_interference_data.evaluate.run.record import Probe
+from robomme_interference_data.runtime.executor import Serial
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")
 pytestmark = pytest.mark.slow
@@ -108,6 +110,23 @@ def test_follow_subgoals_matches_oracle_with_subgoals_and_guess_without(
     assert {status for status, _ in obeyed.values()} == {"success"}
     assert ended("follow-subgoals") == guessed  # the floor, to the very step
     assert {status for status, _ in guessed.values()} != {"success"}
+
+
+def test_a_policy_that_keeps_its_path_is_an_error_before_the_run(
+    buffer_set: Path, tmp_path: Path
+) -> None:
+    """The documentation's example with a reset that clears nothing; as it is, it passes."""
+
+    def probe(policy: str) -> Probe | None:
+        text, out = f"python:support.leaky:{policy}", tmp_path / "run"
+        config = RunConfig(text, buffer_set, out, conditions=("k0", "k1"), families=("MoveCube",))
+        return run_evaluation(config, executor=Serial()).probe
+
+    with pytest.raises(LeakError) as raised:
+        probe("Leaky")
+    assert (raised.value.part, raised.value.step) == ("policy", 0)
+    found = probe("Retrace")
+    assert found is not None and found.verdict == "independent"
 
 
 def test_the_example_policy_learns_to_act(

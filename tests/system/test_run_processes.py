@@ -30,7 +30,7 @@ ROLLOUTS = 10  # two episodes, five conditions
 def start(
     out: Path, pause: float = 0.0, policy: str = runs.CHEAT, words: Sequence[str] = ()
 ) -> subprocess.Popen[str]:
-    usual = f"evaluate {os.environ[worlds.BUFFER_SET]} --simulator {runs.WORLD}"
+    usual = f"evaluate {os.environ[worlds.BUFFER_SET]} --simulator {runs.WORLD} --no-probe"
     usual += " --system mine --workers 2 --families VideoRepick,MoveCube --json"
     called = [sys.executable, "-m", "robomme_interference_data.cli.main", *usual.split()]
     called += ["--policy", policy, *words]

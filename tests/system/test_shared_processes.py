@@ -16,7 +16,12 @@ from support.lazy import lazy
 from support.messages import raises
 from support.worker_calls import wait_until_gone
 
-from robomme_interference_data.errors import InvalidOptionError, PolicyError, ServerDiedError
+from robomme_interference_data.errors import (
+    InvalidOptionError,
+    LeakError,
+    PolicyError,
+    ServerDiedError,
+)
 from robomme_interference_data.evaluate import run_evaluation
 from robomme_interference_data.evaluate.policies.process import policy_processes
 from robomme_interference_data.evaluate.policies.shared import SharedPolicy
@@ -31,7 +36,8 @@ small = lazy("support.lerobot_policies")
 
 def run(out: Path, policy: str = "Remembering", **changes: Any) -> Any:
     shared = {"workers": 2, "policies": 1, "conditions": THREE}
-    return runs.run(out, Processes(2), **{"policy": SHARED + policy, **shared, **changes})
+    policy = policy if ":" in policy else SHARED + policy
+    return runs.run(out, Processes(2), **{"policy": policy, **shared, **changes})
 
 
 @pytest.mark.slow
@@ -53,6 +59,24 @@ def test_rows_are_those_of_policies_that_are_not_shared(
     run(tmp_path / "batched", batch_wait_timeout_s=1.0)
     assert runs.finished_rows(tmp_path / "batched") == expected
     assert {*(tmp_path / "batches").read_text().split()} == {"2"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("policy", "words"),
+    [
+        ("Leaky", "under no-history has another action at step 0 after"),
+        # Its reset clears the memory that all sessions have: two of them at once disturb it.
+        ("OneMemory", "while another client plays"),
+    ],
+)
+def test_a_leak_of_a_shared_policy_is_an_error_before_the_run(
+    tmp_path: Path, policy: str, words: str
+) -> None:
+    with pytest.raises(LeakError) as raised:
+        run(tmp_path / "run", policy=f"python:support.leaky:{policy}", no_probe=False)
+    assert raised.value.part == "policy" and words in raised.value.message
+    assert not (tmp_path / "run" / "run.json").exists()
 
 
 @pytest.mark.slow
@@ -114,7 +138,8 @@ def test_what_cannot_be_shared_is_an_error(tmp_path: Path, changes: dict[str, An
 @pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
 def test_no_process_outlives_the_command(tmp_path: Path, sent: signal.Signals) -> None:
     usual = f"evaluate {os.environ[worlds.BUFFER_SET]} --policy {SHARED}Remembering --system mine"
-    usual += f" --simulator {runs.WORLD} --workers 2 --policies 2 --json --out {tmp_path / 'run'}"
+    usual += f" --simulator {runs.WORLD} --no-probe --workers 2 --policies 2 --json"
+    usual += f" --out {tmp_path / 'run'}"
     command = [sys.executable, "-m", "robomme_interference_data.cli.main", *usual.split()]
     running = subprocess.Popen(
         command,

@@ -123,6 +123,7 @@ def _source(path: Path, run: RunHeader | None) -> dict[str, list[str]]:
     if run is not None:
         lines = [line for invocation in run.invocations for line in invocation.command]
         facts |= {"command": [*dict.fromkeys(lines)]} if lines else {}
+        facts |= {"leak probe": [run.probed]} if run.probed else {}
         facts["run.json"] = [json.dumps(to_dict(run), indent=2, sort_keys=True, ensure_ascii=False)]
     return facts
 
