@@ -219,7 +219,8 @@ def _renderers_note(root: Path) -> str | None:
     """Return what readers must know if the datasets in a folder have different renderers."""
     from robomme_interference_data.data.dataset import Dataset
     from robomme_interference_data.data.loading import built_datasets
-    from robomme_interference_data.data.renderers import dataset_renderers, renderers_note
+    from robomme_interference_data.data.renderers import dataset_renderers
+    from robomme_interference_data.schema.renderers import renderers_note
     from robomme_interference_data.storage.files import LocalFiles
 
     datasets = {name: Dataset(LocalFiles(root / name)) for name in built_datasets(root)}

@@ -139,6 +139,7 @@ class BuildConfig(FittingWorkersConfig):
         metavar="N",
         help="Most units of a recorded episode, evenly spaced; fewer where they would overlap.",
         group="Episodes",
+        rare=True,
     )
     cameras: tuple[str, ...] = setting(
         (),
@@ -157,6 +158,7 @@ class BuildConfig(FittingWorkersConfig):
         "av1-lossless",
         help="av1-lossless (bit-exact) or lerobot-default (smaller, lossy).",
         group="Encoding",
+        rare=True,
     )
     version: str = setting("1.0.0", help="Version of the datasets.", group="Encoding", rare=True)
     time_limit_s: float | None = setting(

@@ -27,12 +27,13 @@ from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.query import Query
 from robomme_interference_data.data.query_sessions import buffer_manifest
 from robomme_interference_data.data.questions import Question
-from robomme_interference_data.data.renderers import dataset_renderers, renderers_note
+from robomme_interference_data.data.renderers import dataset_renderers
 from robomme_interference_data.data.state_reader import other_state_sizes, query_state_size
 from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
 from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.schema.renderers import renderers_note
 from robomme_interference_data.storage.text import read_json
 from robomme_interference_data.viz.filmstrip import strip_png
 

@@ -246,7 +246,7 @@ class PolicyError(InterferenceError, RuntimeError):
 class LeakError(InterferenceError, RuntimeError):
     """A policy, simulator or subgoal writer that carries a state from one rollout to the next.
 
-    Fix: let its reset clear what is left: docs/how-to/your-own-policy.md.
+    Fix: let its reset clear what is left: docs/how-to/compare-systems.md.
 
     Attributes:
         part: What gave the first different value: `policy`, `simulator`, `subgoal writer` or
@@ -254,9 +254,15 @@ class LeakError(InterferenceError, RuntimeError):
         step: Executed steps before it.
     """
 
-    def __init__(self, message: str, hint: str | None = None, *, part: str = "", step: int = 0):
-        super().__init__(message, hint)
-        self.part, self.step = part, step
+    part: str = ""
+    step: int = 0
+
+    @classmethod
+    def of(cls, part: str, step: int, message: str, hint: str) -> Self:
+        """Return the error for a part that keeps a state, seen after so many steps."""
+        error = cls(message, hint)
+        error.part, error.step = part, step
+        return error
 
 
 class PolicyServerError(InterferenceError, ConnectionError):

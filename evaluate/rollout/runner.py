@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from robomme_interference_data.constants import DEMONSTRATIONS, EXECUTIONS, ORACLE
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import open_dataset
-from robomme_interference_data.data.renderers import LIVE_VIEWS, dataset_renderers, renderers_note
+from robomme_interference_data.data.renderers import dataset_renderers
 from robomme_interference_data.data.state_reader import other_state_sizes
 from robomme_interference_data.errors import (
     InterferenceError,
@@ -41,6 +41,7 @@ from robomme_interference_data.evaluate.run.plan import WorkItem, plan_run
 from robomme_interference_data.evaluate.run.worker import PlannedRun, RunContext
 from robomme_interference_data.evaluate.systems import System, SystemFacts, name_system
 from robomme_interference_data.runtime.executor import Executor, WorkerPool
+from robomme_interference_data.schema.renderers import LIVE_VIEWS, renderers_note
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.registry import (
     find_simulator_python,

@@ -145,6 +145,7 @@ class RunConfig(WorkConfig):
         metavar="N",
         group=_EXECUTION,
         help="Maximum rollouts for which a shared policy acts at once.",
+        rare=True,
     )
     batch_wait_timeout_s: float = setting(
         0.01,
@@ -158,6 +159,7 @@ class RunConfig(WorkConfig):
         group=_EXECUTION,
         help="What Ray reserves for each shared policy.",
         shown="cpus=1,gpus=0",
+        rare=True,
     )
     subgoals: str | None = setting(
         None,

@@ -130,12 +130,12 @@ _VALUES = {
 
 def _leak(event: Event, evidence: str) -> LeakError:
     part = event.part.value
-    return LeakError(
+    return LeakError.of(
+        part,
+        event.step,
         f"the {part} keeps a state from one rollout to the next. {evidence}",
         f"Let its reset clear what is left: see {_PAGE}. {named('no_probe')} runs all the "
         "same, and is recorded.",
-        part=part,
-        step=event.step,
     )
 
 

@@ -241,7 +241,8 @@ def _print_extent(report: dict[str, Any]) -> None:
 
 def _warn(opened: "BufferSet", report: dict[str, Any], *, as_json: bool) -> None:
     """Add to the report, or print, what breaks no rule and readers must know."""
-    from robomme_interference_data.data.renderers import dataset_renderers, renderers_note
+    from robomme_interference_data.data.renderers import dataset_renderers
+    from robomme_interference_data.schema.renderers import renderers_note
 
     note = renderers_note(dataset_renderers(opened.datasets).items())
     if note is None:

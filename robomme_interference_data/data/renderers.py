@@ -1,17 +1,11 @@
-"""Which renderers drew the images that a policy compares: lessons, units and live views."""
+"""The renderers that datasets record."""
 
-from collections import defaultdict
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
-if TYPE_CHECKING:
-    from .dataset import Dataset
-
-LIVE_VIEWS = "live views"
-"""The images of a rollout itself, beside those of datasets."""
+from .dataset import Dataset
 
 
-def dataset_renderers(datasets: Mapping[str, "Dataset"]) -> dict[str, str | None]:
+def dataset_renderers(datasets: Mapping[str, Dataset]) -> dict[str, str | None]:
     """Return the renderer that each dataset records; None if it is unknown, as of recordings."""
     renderers = {}
     for name, dataset in datasets.items():
@@ -19,25 +13,3 @@ def dataset_renderers(datasets: Mapping[str, "Dataset"]) -> dict[str, str | None
         known = sorted(recorded - {""}) if dataset.cameras else []
         renderers[name] = " and ".join(known) or None
     return renderers
-
-
-def renderers_note(renderers: Iterable[tuple[str, str | None]]) -> str | None:
-    """Return a sentence about images that different renderers drew; None if none are known to be.
-
-    Args:
-        renderers: Names of datasets, or `LIVE_VIEWS`, with a renderer, or None if it is unknown.
-    """
-    drawn = defaultdict[str | None, dict[str, None]](dict)  # without repetitions, in their order
-    for images, renderer in renderers:
-        drawn[renderer][images] = None
-    without = drawn.pop(None, {})
-    if len(drawn) < 2:
-        return None
-    origins = [f"{' and '.join(images)} from {renderer}" for renderer, images in drawn.items()]
-    known = {images for named in drawn.values() for images in named}
-    if unknown := [images for images in without if images not in known]:
-        origins.append(f"{' and '.join(unknown)} unknown")
-    return (
-        f"Images come from different renderers: {'; '.join(origins)}. Their pixels may differ, and "
-        "a policy can see that."
-    )

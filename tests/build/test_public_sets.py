@@ -35,7 +35,7 @@ def test_from_recordings_to_a_policy(name: str, tmp_path: Path, run: Any) -> Non
     code, _, err = run(
         *("build", root, "--source", f"lerobot:{source}", "--families-from", names),
         *("--split", "test", "--conditions", "no-history,k0,k1", "--with", "executions"),
-        *("--codec", "lerobot-default", *SMALL, *options),
+        *("--set", "codec=lerobot-default", *SMALL, *options),
     )
     assert code == 0, err
     code, out, err = run("verify", root)

@@ -134,7 +134,7 @@ def test_shards_that_do_not_belong_together(tmp_path: Path, source: MadeUpSource
     ):
         build(tmp_path / name, *options)
         merge(one, tmp_path / name)
-    source.provenance = {"kind": "made-up", "versions": "2"}
+    source.provenance = {"kind": "made-up", "versions": {"made-up": "2"}}
     build(tmp_path / "newer", "--shard", "2/2")
     merge(one, tmp_path / "newer")
 

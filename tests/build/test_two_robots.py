@@ -25,7 +25,7 @@ from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Serial
 
 QUERIES = ("Lift/test/0", "Stack/test/0")
-UNITS = ["--unit", "4x2", "--units-per-episode", 2, "--resize", "24x16:pad"]
+UNITS = ["--unit", "4x2", "--set", "units_per_episode=2", "--resize", "24x16:pad"]
 
 
 def picture(recording: int, number: int) -> Any:

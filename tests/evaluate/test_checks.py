@@ -221,7 +221,7 @@ def test_only_cameras_in_use_are_rendered(tiny_buffers: Path) -> None:
     assert options("tabletop", "front", **step)["cameras"] == ("front", "wrist")
     assert options("tabletop", videos=True)["cameras"] == ("front", "wrist")
     assert options("robomme", "front", simulator_timeout_s=100.0) == {
-        **{"cameras": ("front",), "answer_s": 90.0, "subgoals": False}
+        **{"cameras": ("front",), "answer_s": 90.0, "subgoals": False, "python": None}
     }
     oracle = {"policy": "websocket://h:1", "subgoals": "oracle"}
     assert options("robomme", "front", **oracle)["subgoals"] is True

@@ -13,6 +13,7 @@ from support.scoring import STATUS
 from support.scoring import row as scored_row
 from typer.testing import CliRunner
 
+from robomme_interference_data.cli.merge_command import merge
 from robomme_interference_data.constants import FAMILIES
 from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.evaluate import commands
@@ -28,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("trouble", "_serial")
 
 APP = typer.Typer(rich_markup_mode="markdown", pretty_exceptions_enable=False)
 APP.command()(commands.evaluate)
-APP.command()(commands.merge)
+APP.command()(merge)
 APP.command()(commands.ceiling)
 OWN = "python:support.own_policies:"
 USUAL = "--simulator support.worlds:World --system mine --episodes 0"

@@ -34,6 +34,7 @@ IDENTITY = {
         *("policy", "policy_options"),  # in policy_identity
         *("subgoals", "subgoal_prompt", "subgoal_options"),  # in subgoals_identity
         *("simulator", "buffer_set", "shift", "offline"),  # offline sets the simulator
+        "simulator_options",
     },
     AskConfig: {
         *("model", "model_options", "prompt"),  # in model_identity, and the prompt's digest
@@ -48,6 +49,7 @@ FREE = {
     },
     RunConfig: {
         *("out", "videos", "check_lesson", "simulator_timeout_s", "no_probe"),
+        "simulator_python",  # its versions are in the identity
         "history_chunk",
         *("policies", "max_batch_size", "batch_wait_timeout_s", "policy_resources"),
     },

@@ -16,7 +16,12 @@ from robomme_interference_data.evaluate.score.tables.paper import differing
 from robomme_interference_data.evaluate.systems import SYSTEMS
 
 RATES = made.RELEASED.parent / "by_family_condition.csv"
-NO_ROWS = {"robomme/lessons.parquet", "robomme/shortcuts.csv", "training/rates.csv"}
+NO_ROWS = {
+    "robomme/ceilings.csv",
+    "robomme/lessons.parquet",
+    "robomme/shortcuts.csv",
+    "training/rates.csv",
+}
 FILES = [
     path
     for path in sorted(RESULTS.rglob("*.*"))

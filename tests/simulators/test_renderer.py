@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from robomme_interference_data.data.renderers import renderers_note
+from robomme_interference_data.schema.renderers import renderers_note
 from robomme_interference_data.simulators import sapien_renderer
 from robomme_interference_data.simulators.registry import simulator_renderer
 from robomme_interference_data.simulators.sapien_renderer import describe_renderer, renderer_in

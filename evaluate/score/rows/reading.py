@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robomme_interference_data.data.renderers import renderers_note
 from robomme_interference_data.errors import FormatError, InvalidOptionError, counted, named
+from robomme_interference_data.schema.renderers import renderers_note
 
 from .checks import Checks
 from .files import find_sources, read_file, with_stated
