@@ -24,7 +24,6 @@ from common import positive, print_machine, print_table
 
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.simulators.robomme import maniskill_patches
-from robomme_interference_data.simulators.robomme.process import find_python
 from robomme_interference_data.simulators.robomme.simulator import RoboMMESimulator
 
 FAMILIES = ("VideoUnmask", "PatternLock")
@@ -108,7 +107,7 @@ def main() -> None:
     parser.add_argument("--steps", type=positive, default=64, help="steps of a rollout, at most")
     parser.add_argument("--rounds", type=positive, default=3)
     given = parser.parse_args()
-    python = find_python(given.python)
+    python = RoboMMESimulator.interpreter(given.python).path
     print_machine()
     rows = []
     for family in given.families:
