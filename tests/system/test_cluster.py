@@ -145,7 +145,7 @@ def test_a_policy_is_shared_on_a_cluster_and_started_again(cluster: Any, tmp_pat
     options = ("fault=die",)
     runs.run(tmp_path / "own", policy=policy, policy_options=options, conditions=CONDITIONS)
     Path(os.environ[FAULT], "die").touch()
-    shared = f"--policy {policy} --policy-option fault=die --workers 2 --policies 1"
+    shared = f"--policy {policy} --policy-option fault=die --workers 2 --policies 1 --no-probe"
     running = driver(tmp_path / "run", cluster.address, shared)
     answer, err = running.communicate(timeout=300)
     assert running.returncode == 0 and len(json.loads(answer)) == ROLLOUTS, err
