@@ -34,7 +34,7 @@ def verify_buffer(
     stored, recorded = query.first_frame, query.record.span_sha256
     span = stored.frame, stored.frame + 1
     sha256 = recorded.query if recorded else ""
-    what = f"{manifest}: first live view"
+    what = f"{manifest}: first live observation"
     _check_span(what, query.dataset, stored.episode_index, span, sha256)
 
 

@@ -111,8 +111,8 @@ class Timing:
 
     predecessor: Annotated[
         str | None,
-        "What the same policy did before, such as `MoveCube/test/3 k7`: of a policy that workers "
-        "share and of a server, over this worker's connection. None if it was new.",
+        "The rollout that the policy played just before, such as `MoveCube/test/3 k7`; None if it "
+        "was new. Of a shared policy or a server, the last one of this worker.",
     ] = None
     reset_s: Annotated[float | None, "Seconds to reset the simulator."] = None
     history_s: Annotated[float | None, "Seconds to decode and deliver the history."] = None
