@@ -14,6 +14,7 @@ from robomme_interference_data.constants import (
     PAPER_UNIT,
     POSITION_LIMIT,
 )
+from robomme_interference_data.package import DISTRIBUTION, install_source
 from robomme_interference_data.viz.tables import Table
 from robomme_interference_data.viz.templates import fill
 
@@ -23,7 +24,6 @@ from .publication import OTHER, Publication
 from .tables import column_table
 
 README = "README.md"
-DISTRIBUTION = "robomme-interference-data"
 
 PAPER = "https://arxiv.org/abs/2606.22338"
 BIBTEX = f"""@article{{rathi2026robommeinterference,
@@ -50,13 +50,6 @@ _FILTERS = {
     "raw": Raw,
     "number": "{:,}".format,
 }
-
-
-def _install() -> str:
-    """Return the command that installs this package: from its repository, as no index has it."""
-    urls = metadata.metadata(DISTRIBUTION).get_all("Project-URL", [])
-    pairs = (url.split(", ") for url in urls)
-    return f"pip install git+{dict(pairs)['Repository']}"
 
 
 def card_files(facts: Facts, publication: Publication) -> dict[str, bytes]:
@@ -95,7 +88,7 @@ def card_text(facts: Facts, publication: Publication) -> str:
         "repositories": facts.repositories,
         "paper": PAPER,
         "bibtex": BIBTEX,
-        "install": _install(),
+        "install": f"pip install {install_source()}",
         "other": OTHER,
         "frames": facts.examples,
         "split_name": facts.tables[0].split,

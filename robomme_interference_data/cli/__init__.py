@@ -2,6 +2,7 @@ import os
 import signal
 import sys
 
+from robomme_interference_data.package import install_source
 from robomme_interference_data.runtime.safe_path import set_safe_path
 
 
@@ -12,7 +13,7 @@ def run_program() -> None:
     try:
         from .main import main
     except ImportError as error:  # a required library is missing or broken, so nothing can run
-        fix = "pip install --force-reinstall robomme-interference-data"
+        fix = f"pip install --force-reinstall {install_source()}"
         sys.exit(f"Error: a required library cannot be imported: {error}\nReinstall it: {fix}")
 
     signal.signal(signal.SIGINT, _interrupt)

@@ -23,9 +23,8 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
     first_line,
 )
+from robomme_interference_data.package import DISTRIBUTION, install_source
 from robomme_interference_data.storage.hub import check_endpoint
-
-DISTRIBUTION = "robomme-interference-data"
 
 RENDERER = "robomme_interference_data.simulators.tabletop.renderer"
 """Draws an image in a process of its own, since a broken driver can crash or hang it."""
@@ -123,7 +122,7 @@ def check_packages(extra: str = "") -> Check:
         if extra in TORCH_EXTRAS and util.find_spec("torch") is None:
             problems.append("brings PyTorch for CUDA, 5 GB; for the CPU: uv, --torch-backend cpu")
         return Check(name, None, ", ".join(problems), f'pip install "{DISTRIBUTION}[{extra}]"')
-    fix = f"pip install --force-reinstall {DISTRIBUTION}"
+    fix = f"pip install --force-reinstall {install_source()}"
     return Check(name, False, ", ".join(problems), fix)
 
 

@@ -57,6 +57,8 @@ REQUIREMENTS = {
     ],
     "lerobot": ['datasets<5,>=4.8; extra == "dataset"', 'pygame; extra == "teleop"'],
 }
+SOURCE = "git+https://github.com/SoumilRathi/robomme-interference-data"
+
 GOOD = {"numpy": "2.2.6", "lerobot": "0.6.1", "h5py": "3.16.0", "datasets": "4.8.5"}
 BAD = {"numpy": "1.26.4", "lerobot": "0.6.1", "datasets": "5.0.0"}
 
@@ -65,15 +67,7 @@ BAD = {"numpy": "1.26.4", "lerobot": "0.6.1", "datasets": "5.0.0"}
     ("installed", "extra", "row"),
     [
         (GOOD, "build", (True, "lerobot 0.6.1, h5py 3.16.0", None)),
-        (
-            BAD,
-            "",
-            (
-                False,
-                "numpy 1.26.4 is not >=2.0",
-                "pip install --force-reinstall robomme-interference-data",
-            ),
-        ),
+        (BAD, "", (False, "numpy 1.26.4 is not >=2.0", f"pip install --force-reinstall {SOURCE}")),
         (
             BAD,
             "build",
@@ -242,7 +236,7 @@ def test_a_broken_library_is_reported(tmp_path: Path) -> None:
     (row,) = [row for row in json.loads(done.stdout) if row["name"] == "Core libraries"]
     assert (done.returncode, done.stderr, row["ok"]) == (1, "", False)
     assert "libarrow.so is missing" in row["detail"]
-    assert row["fix"] == "pip install --force-reinstall robomme-interference-data"
+    assert row["fix"] == f"pip install --force-reinstall {SOURCE}"
 
 
 def test_without_the_library_of_the_command_line(tmp_path: Path) -> None:
@@ -252,7 +246,7 @@ def test_without_the_library_of_the_command_line(tmp_path: Path) -> None:
     done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert done.stderr.startswith("Error: ") and "no typer" in done.stderr
-    assert done.stderr.endswith("pip install --force-reinstall robomme-interference-data\n")
+    assert done.stderr.endswith(f"pip install --force-reinstall {SOURCE}\n")
     assert len(done.stderr.splitlines()) == 2
 
 
