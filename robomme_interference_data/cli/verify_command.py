@@ -149,7 +149,8 @@ class _PlayedAgain:
         from robomme_interference_data.progress import WorkProgress
         from robomme_interference_data.runtime.executor import Serial, make_executor
 
-        settings = self.settings
+        memory = max((played.source.worker_gb for played in plan.datasets.values()), default=0)
+        settings = self.settings.fitting(memory)
         # One worker needs no process of its own: there is nothing to write.
         alone = settings.workers == 1 and not settings.on_cluster
         executor = Serial() if alone else make_executor(settings)

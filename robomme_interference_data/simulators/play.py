@@ -14,6 +14,7 @@ from robomme_interference_data.storage.files import atomic_path
 from robomme_interference_data.viz.episode_video import EpisodeVideo, check_pillow
 
 from .base import Simulator
+from .episode import check_drawn
 
 Images = Mapping[str, NDArray[np.uint8]]
 
@@ -25,6 +26,7 @@ def play(simulator: Simulator, episode: str, policy: str, video: Path | None) ->
     """Play an episode's demonstration, then a policy; return what `simulate` prints about it."""
     with _recording(video, episode, policy) as add:
         lesson, first, info = simulator.reset(episode)
+        check_drawn(lesson, first, first.images)
         steps, status = 0, Status.ONGOING
         for index in range(len(lesson)):
             images = {camera: frames[index] for camera, frames in lesson.images.items()}

@@ -161,13 +161,20 @@ def test_an_incomplete_answer_names_what_is_missing(bare_python: Path, tmp_path:
         "        import numpy as np\n"
         "        states = [np.zeros(3, np.float32)] * 4\n"
         "        image = [np.zeros((4, 4, 3), np.uint8)] * 4\n"
-        "        return {}, [{}, {'states': states}, {'states': states, 'top': image}][index]\n"
+        "        whole = {'states': states, 'top': image}\n"
+        "        facts = {3: {'goals': 'go'}, 4: {'goals': ['go']}}.get(index, {})\n"
+        "        return facts, [{}, {'states': states}, whole, whole, whole][index]\n"
+        "    def step(self, action, observe): return {'status': 'done'}, {}\n"
+        "    def close(self): pass\n"
     )
     half = type("Half", (Dot,), {"worker": file})
     with half(bare_python) as simulator:
-        for index in range(3):
+        for index in range(4):
             with raises(SimulatorError):
                 simulator.reset(f"LeftSide/test/{index}")
+        simulator.reset("LeftSide/test/4")
+        with raises(SimulatorError):
+            simulator.step(RIGHT)
 
 
 # --- interpreters ------------------------------------------------------------------------------

@@ -159,8 +159,10 @@ class RemoteSimulator(Simulator):
         evidence = self._evidence(episode, arrays)
         lesson = Demonstration(images, arrays["states"][:-1], actions, *evidence)
         facts = self._facts
-        goals = tuple(self.fact("goals"))
-        info = EpisodeInfo(goals, facts.get("difficulty"), facts.get("seed"), self.name)
+        goals = self.fact("goals")
+        if not isinstance(goals, list) or not goals:  # the letters of a text are no goals
+            raise self._incomplete(f"has the goals {goals!r}; expected a list of texts")
+        info = EpisodeInfo(tuple(goals), facts.get("difficulty"), facts.get("seed"), self.name)
         return lesson, first, info
 
     def _chosen(self, episode: EpisodeId) -> dict[str, Any]:
@@ -179,11 +181,13 @@ class RemoteSimulator(Simulator):
         self, episode: EpisodeId, action: NDArray[np.float32], observe: bool
     ) -> tuple[Observation, Status]:
         arrays = self.call("step", action=action.tolist(), observe=observe)
-        status = Status(self.fact("status"))
-        if status is Status.ERROR:
+        status = self.fact("status")
+        if status not in list(Status):
+            raise self._incomplete(f"has the status {status!r}; expected {', '.join(Status)}")
+        if status == Status.ERROR:
             what = f"reports an error at step {self._steps}: {self.fact('message')}"
             raise self._process.error(what)
-        return self._observation(arrays, self._cameras if observe else ()), status
+        return self._observation(arrays, self._cameras if observe else ()), Status(status)
 
     def _act(
         self, policy: str, known: Mapping[int, str], answer: int | None
