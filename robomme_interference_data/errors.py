@@ -246,7 +246,7 @@ class PolicyError(InterferenceError, RuntimeError):
 class LeakError(InterferenceError, RuntimeError):
     """A policy, simulator or subgoal writer that carries a state from one rollout to the next.
 
-    Fix: let its reset clear what is left: docs/how-to/compare-systems.md.
+    Fix: let its reset clear what is left: docs/how-to/your-own-policy.md.
 
     Attributes:
         part: What gave the first different value: `policy`, `simulator`, `subgoal writer` or
