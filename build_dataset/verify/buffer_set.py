@@ -65,10 +65,12 @@ def verify_buffer_set(
         except InterferenceError as error:
             yield Violation(name, error.message)
             continue
-        if copy is None and header.datasets[name].location is not None and folder == root / name:
+        location = header.datasets[name].location
+        own = copy is None and folder == root / name
+        if own and location is not None and not _is_downloaded(folder, location):
             # The folder is read; whoever publishes the manifests would send readers elsewhere.
-            elsewhere = f"location of the {name} is {header.datasets[name].location}; the folder "
-            yield Violation(HEADER, f"{elsewhere}{name} is here: expected none")
+            what = f"location of the {name} is {location}; the folder {name} is no download of it"
+            yield Violation(HEADER, f"{what}: expected none")
         if not folder.is_relative_to(root):  # in a repository of its own
             for path in further_files(folder, ()):
                 yield Violation(f"{name}/{path}", "is not part of the dataset")
@@ -157,6 +159,17 @@ def undecoded_frames(buffer_set: BufferSet) -> int:
         if copy.holds(dataset, record.episode_index)
         and not copy.holds_all(dataset, record.episode_index)
     )
+
+
+def _is_downloaded(folder: Path, location: str) -> bool:
+    """Whether `hf download` filled a folder from a location, a commit of a repository.
+
+    It notes the commit of each file:
+    https://huggingface.co/docs/huggingface_hub/guides/download#download-files-to-a-local-folder
+    """
+    notes = folder.glob(".cache/huggingface/download/**/*.metadata")
+    commits = {note.read_text(encoding="utf-8").partition("\n")[0] for note in notes}
+    return commits == {location.rpartition("@")[2]}
 
 
 def _files(buffer_set: BufferSet, root: Path) -> Iterator[Violation]:
