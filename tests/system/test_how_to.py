@@ -42,6 +42,8 @@ NOT_RUN = {
     ("connect-a-policy.md", "build my-training"): "hours of simulation",
     ("many-machines.md", "evaluate namespace/name --executor ray"): "a cluster; test_cluster.py",
     ("many-machines.md", "index my-buffers --encoder siglip"): "a cluster and 3.5 GB of weights",
+    ("many-machines.md", "build shards/"): "hours of simulation; test_shards.py",
+    ("many-machines.md", "merge shards/1"): "the same",
     (
         "official-simulator.md",
         "simulate MoveCube/test/0 --simulator robomme",
@@ -79,7 +81,7 @@ an entry that fits no step is an error."""
 
 OTHER_PROGRAMS = {
     *("pip", "export", "hf", "uv", "swift", "vllm", "lerobot-train", "vla-eval", "cd"),
-    *("python", "IMAGE_MAX_TOKEN_NUM=256"),
+    *("python", "IMAGE_MAX_TOKEN_NUM=256", "git", "scripts/install_robomme.sh"),
 }
 """Programs that are not this package's; those that train and answer have tests of their own."""
 
