@@ -56,6 +56,10 @@ NOT_RUN = {
         "official-simulator.md",
         "build my-buffers --only distractors",
     ): "RoboMME's recordings; test_source_h5.py",
+    ("official-simulator.md", "build shards/"): "RoboMME and days of simulation; test_shards.py",
+    ("official-simulator.md", "merge shards/"): "the same",
+    ("official-simulator.md", "verify official"): "the same",
+    ("official-simulator.md", "publish official"): "the same; test_publish.py",
     ("official-simulator.md", "evaluate my-buffers --simulator robomme"): "the same",
     (
         "official-simulator.md",
