@@ -65,6 +65,10 @@ NOT_RUN = {
         "official-simulator.md",
         "evaluate my-buffers --policy websocket",
     ): "released checkpoints and RoboMME; test_systems.py",
+    (
+        "official-simulator.md",
+        "evaluate my-buffers --policy 'websocket",
+    ): "released checkpoints and RoboMME; test_servers.py",
     ("official-simulator.md", "index my-buffers --encoder siglip"): "3.5 GB of weights",
     ("train-a-policy.md", "build my-"): "hours of simulation",
     ("train-a-policy.md", "from robomme_interference_data.training"): "test_history_dataset.py",
