@@ -1,5 +1,6 @@
 """Contradicting lessons: the scene of a query with another answer."""
 
+import sys
 from collections import Counter
 
 import numpy as np
@@ -64,6 +65,7 @@ def test_other_answers_occur_equally_often() -> None:
             assert len(found) == count - 1
 
 
-def test_official_episodes_have_no_other_answer() -> None:
+def test_official_episodes_have_no_other_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROBOMME_PYTHON", sys.executable)
     with raises(SourceError):
         SimulatorSource("robomme").contradict(SourceEpisode(EpisodeId("MoveCube", "test", 0)))
