@@ -116,9 +116,9 @@ def _run(config: RunConfig | AskConfig, kept: str, unit: str, *, as_json: bool) 
     """Run, and print the results; exit with 1 after errors."""
     from robomme_interference_data.schema.codec import to_dict
 
+    from .probe.result import INDEPENDENT, probe_text
     from .run.evaluation import run_evaluation
     from .run.progress import RunProgress, error_table, rate_table
-    from .run.record import INDEPENDENT, probe_text
 
     check_output(config.out)
     offline = isinstance(config, RunConfig) and config.offline

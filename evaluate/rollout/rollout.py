@@ -17,11 +17,11 @@ from robomme_interference_data.data.buffer import Buffer, Chunk
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import InvalidOptionError, PolicyError, RunError
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
+from robomme_interference_data.evaluate.probe.trace import Trace
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.history import HistoryReader, history_columns
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout, model_columns
-from robomme_interference_data.evaluate.run.traces import Trace
 from robomme_interference_data.evaluate.run.worker import RunContext
 from robomme_interference_data.evaluate.systems import check_history, name_system
 from robomme_interference_data.runtime.executor import Worker

@@ -19,11 +19,13 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy, starts_server
+from robomme_interference_data.evaluate.probe.clients import Calls, Interleaved, Recorder
+from robomme_interference_data.evaluate.probe.plays import SHORT_STEPS, ProbeTask
+from robomme_interference_data.evaluate.probe.trace import Play, Trace
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout
-from robomme_interference_data.evaluate.run.traces import SHORT_STEPS, Play, Trace
-from robomme_interference_data.evaluate.run.worker import Job, ProbeTask, RunFunction
+from robomme_interference_data.evaluate.run.worker import Job, RunFunction
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.codec import to_dict
@@ -37,7 +39,6 @@ from robomme_interference_data.simulators.registry import (
 )
 
 from .checks import check_episode
-from .clients import Calls, Interleaved, Recorder
 from .rollout import run_rollout
 from .settings import simulator_options, used_cameras
 

@@ -30,6 +30,7 @@ from robomme_interference_data.errors import (
     SimulatorCrashError,
     first_line,
 )
+from robomme_interference_data.evaluate.probe.result import Probe, probe_text
 from robomme_interference_data.runtime.executor import (
     Executor,
     Outcome,
@@ -46,7 +47,6 @@ from .faults import error_text, first_fault, first_trace
 from .identity import invocation, now, plain, run_identity
 from .log import RunLog, count_statuses, open_log
 from .plan import WorkItem, shuffle_work
-from .record import Probe, probe_text
 from .row import Rollout, is_done, row_line, row_of
 from .worker import Job, PlannedRun, RunContext
 
@@ -191,7 +191,8 @@ def _probe(
         return None
     if pool is None or all(item in log.rows and is_done(log.rows[item]) for item in items):
         return None
-    from .probe import probe_run  # questions have none
+    # Here, because questions have no probe.
+    from robomme_interference_data.evaluate.probe.probe import probe_run
 
     note = (lambda text: None) if progress is None else progress.note
     probe = probe_run(run, items, pool, note)

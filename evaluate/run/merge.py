@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.errors import RunError
+from robomme_interference_data.evaluate.probe.result import joined_probe
 from robomme_interference_data.schema.rollouts import TIMING_COLUMNS
 from robomme_interference_data.storage.files import LocalFiles
 
 from .log import ERRORS_LOG, check_same_run, open_log, read_run
 from .plan import WorkItem
-from .record import joined_probe
 from .row import Rollout, is_done
 
 

@@ -22,7 +22,6 @@ from .config import AskConfig, RetrievalConfig, RunConfig
 from .history import HistoryReader
 from .plan import RunPlan, WorkItem
 from .row import Rollout
-from .traces import PlannedPlay
 
 if TYPE_CHECKING:
     from robomme_interference_data.retrieval.selector import Selector
@@ -114,21 +113,6 @@ class Job[C: RunConfig | AskConfig]:
 
     item: WorkItem
     run: RunContext[C]
-
-
-@dataclass(frozen=True)
-class ProbeTask:
-    """Rollouts that a worker plays for the leak probe, one after the other; it returns `Play`s.
-
-    Attributes:
-        run: Their run.
-        turns: What to play.
-        fresh: Whether to begin with a policy, simulator and subgoal writer that played nothing.
-    """
-
-    run: RunContext[RunConfig]
-    turns: tuple[PlannedPlay, ...]
-    fresh: bool
 
 
 def make_selector(config: RetrievalConfig) -> "Selector | None":

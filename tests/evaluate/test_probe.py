@@ -19,23 +19,17 @@ from support.serve_policy import command
 from robomme_interference_data.errors import LeakError
 from robomme_interference_data.evaluate.language import subgoal_settings
 from robomme_interference_data.evaluate.language.subgoal_writers import OracleWriter
-from robomme_interference_data.evaluate.run.plan import WorkItem
-from robomme_interference_data.evaluate.run.record import Probe, joined_probe
-from robomme_interference_data.evaluate.run.traces import (
+from robomme_interference_data.evaluate.probe.judgment import ProbeVerdict, first_difference, judge
+from robomme_interference_data.evaluate.probe.noise import LEAK_P, flips, noise_p
+from robomme_interference_data.evaluate.probe.plays import (
     ENOUGH_ROLLOUTS,
-    LEAK_P,
-    Event,
-    Origin,
     PlannedPlay,
-    Play,
-    ProbeVerdict,
-    first_difference,
-    flips,
-    judge,
-    noise_p,
     rounds,
     sequence,
 )
+from robomme_interference_data.evaluate.probe.result import Probe, joined_probe
+from robomme_interference_data.evaluate.probe.trace import Event, Origin, Play
+from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.ids import EpisodeId
 
 servers = lazy("support.vla_eval_servers")

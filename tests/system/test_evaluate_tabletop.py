@@ -10,7 +10,7 @@ from support.runs import untimed
 
 from robomme_interference_data.errors import LeakError, NoRendererError
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
-from robomme_interference_data.evaluate.run.record import Probe
+from robomme_interference_data.evaluate.probe.result import Probe
 from robomme_interference_data.runtime.executor import Serial
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")

@@ -1,8 +1,11 @@
 """The leak probe: before a run, find out whether a state survives a reset.
 
 A policy that carries one rollout into the next changes results as interference does. The probe
-plays a few rollouts, with the workers and policies of the run, again after other ones; `traces.py`
-has its rules. It writes nothing: a run begins only without a leak.
+plays a few rollouts, with the workers and policies of the run, again after other ones. It writes
+nothing: a run begins only without a leak.
+
+`plays.py` has what is played, `trace.py` what of it is compared, `judgment.py` and `noise.py` what
+follows, and `result.py` what is recorded.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -21,26 +24,16 @@ from robomme_interference_data.errors import (
     named,
 )
 from robomme_interference_data.evaluate.policies.registry import server_addresses
+from robomme_interference_data.evaluate.run.config import RunConfig
+from robomme_interference_data.evaluate.run.plan import WorkItem
+from robomme_interference_data.evaluate.run.worker import RunContext
 from robomme_interference_data.runtime.executor import WorkerPool
 
-from .config import RunConfig
-from .plan import WorkItem
-from .record import BROKEN, INDEPENDENT, NONDETERMINISTIC, Probe
-from .traces import (
-    LEAK_P,
-    Event,
-    FirstDifference,
-    Origin,
-    PlannedPlay,
-    Play,
-    ProbeVerdict,
-    flips,
-    judge,
-    noise_p,
-    rounds,
-    sequence,
-)
-from .worker import ProbeTask, RunContext
+from .judgment import FirstDifference, ProbeVerdict, judge
+from .noise import LEAK_P, flips, noise_p
+from .plays import PlannedPlay, ProbeTask, rounds, sequence
+from .result import BROKEN, INDEPENDENT, NONDETERMINISTIC, Probe
+from .trace import Event, Origin, Play
 
 _REPEATS = 3
 """How often all plays are repeated, in the same order and with a new policy, once two differ."""
