@@ -58,11 +58,11 @@ def judge(plays: Sequence[Play]) -> tuple[ProbeVerdict, FirstDifference | None]:
 
 
 def _since_new(play: Play) -> tuple[object, ...]:
-    return play.turn.item, play.turn.beside, play.past
+    return play.planned.item, play.planned.beside, play.past
 
 
 def _just_before(play: Play) -> tuple[object, ...]:
-    return play.turn.item, play.turn.beside, play.after
+    return play.planned.item, play.planned.beside, play.after
 
 
 def _step(difference: FirstDifference) -> int:
@@ -73,7 +73,7 @@ def _differences(plays: Sequence[Play]) -> list[FirstDifference]:
     """Return the first difference of each two plays of a rollout that differ."""
     found = []
     for first, second in combinations(plays, 2):
-        if first.turn.item == second.turn.item:
+        if first.planned.item == second.planned.item:
             event = first_difference(first.events, second.events)
             if event is not None:
                 found.append(FirstDifference(event, first, second))

@@ -37,7 +37,7 @@ def noise_p(repeats: Sequence[Sequence[Play]], plays: Sequence[Play]) -> float:
     found = [
         _halves_p([play.first_action for play in (*first, *second)])
         for first, second in combinations(places, 2)
-        if first[0].turn.item == second[0].turn.item
+        if first[0].planned.item == second[0].planned.item
     ]
     fours = [same for same in _same_predecessor(plays) if len(same) == 2]
     for distance in (_action_distance, _outcome_distance):
@@ -69,7 +69,7 @@ def _same_predecessor(plays: Sequence[Play]) -> list[list[tuple[Play, Play]]]:
     groups: dict[WorkItem, dict[str, list[Play]]] = {}
     for play in plays:
         if play.after is not None:
-            groups.setdefault(play.turn.item, {}).setdefault(play.after, []).append(play)
+            groups.setdefault(play.planned.item, {}).setdefault(play.after, []).append(play)
     return [
         [(group[0], group[1]) for group in own.values() if len(group) > 1]
         for own in groups.values()

@@ -57,12 +57,12 @@ def sequence(items: Sequence[WorkItem], *, clients: int) -> tuple[PlannedPlay, .
     others = [item for item in ordered if item.episode.family != first.episode.family]
     others = others or [item for item in ordered if item.episode != first.episode] or [*ordered]
     second = max(others, key=_history_rank)
-    turns = [PlannedPlay(first), PlannedPlay(second), PlannedPlay(first)]
+    planned = [PlannedPlay(first), PlannedPlay(second), PlannedPlay(first)]
     if len(items) >= ENOUGH_ROLLOUTS:
-        turns += [PlannedPlay(second, whole=True), PlannedPlay(first)]
+        planned += [PlannedPlay(second, whole=True), PlannedPlay(first)]
     if clients > 1:
-        turns.append(PlannedPlay(second, beside=first))
-    return tuple(turns)
+        planned.append(PlannedPlay(second, beside=first))
+    return tuple(planned)
 
 
 def rounds(items: Sequence[WorkItem]) -> tuple[PlannedPlay, ...]:
@@ -87,10 +87,10 @@ class ProbeTask:
 
     Attributes:
         run: Their run.
-        turns: What to play.
+        planned: What to play.
         fresh: Whether to begin with a policy, simulator and subgoal writer that played nothing.
     """
 
     run: RunContext[RunConfig]
-    turns: tuple[PlannedPlay, ...]
+    planned: tuple[PlannedPlay, ...]
     fresh: bool

@@ -33,7 +33,7 @@ from .judgment import FirstDifference, ProbeVerdict, judge
 from .noise import LEAK_P, flips, noise_p
 from .plays import PlannedPlay, ProbeTask, rounds, sequence
 from .result import BROKEN, INDEPENDENT, NONDETERMINISTIC, Probe
-from .trace import Event, Origin, Play
+from .trace import Component, Event, Play
 
 _REPEATS = 3
 """How often all plays are repeated, in the same order and with a new policy, once two differ."""
@@ -60,22 +60,22 @@ def probe_run(
         WorkerRetiredError: No worker is left, such as without its server.
     """
     clients = 2 if _shares_policy(run.config) else 1
-    turns = sequence(items, clients=clients)
-    rollouts = tuple(dict.fromkeys(turn.item.key for turn in turns))
-    found = Probe(INDEPENDENT, rollouts, len(turns), clients)
-    note(f"probing for a state that survives a reset: {counted(len(turns), 'short rollout')}")
+    planned = sequence(items, clients=clients)
+    rollouts = tuple(dict.fromkeys(play.item.key for play in planned))
+    found = Probe(INDEPENDENT, rollouts, len(planned), clients)
+    note(f"probing for a state that survives a reset: {counted(len(planned), 'short rollout')}")
     try:
-        first = _play(run, pool, turns)
+        first = _play(run, pool, planned)
         _, difference = judge(first)
         if difference is None:
             return found
-        part = difference.event.part.value
-        note(f"the {part} differs: {counted(_REPEATS * len(turns), 'more short rollout')}")
-        repeats = _repeat(run, pool, turns, first)
+        component = difference.event.component.value
+        note(f"the {component} differs: {counted(_REPEATS * len(planned), 'more short rollout')}")
+        repeats = _repeat(run, pool, planned, first)
         difference = _judged(chain(*repeats)) or difference  # the first plays alone may differ
         more = rounds(items)
-        note(f"the {part} is not deterministic: {counted(len(more), 'whole rollout')}")
-        repeats += _repeat(run, pool, turns, repeats[-1])
+        note(f"the {component} is not deterministic: {counted(len(more), 'whole rollout')}")
+        repeats += _repeat(run, pool, planned, repeats[-1])
         plays = _play(run, pool, more, fresh=False)
         _judged(plays)
     except _BrokenError as error:
@@ -91,8 +91,8 @@ def probe_run(
     return replace(
         found,
         verdict=NONDETERMINISTIC,
-        plays=(1 + len(repeats)) * len(turns) + len(plays),
-        part=event.part.value,
+        plays=(1 + len(repeats)) * len(planned) + len(plays),
+        component=event.component.value,
         step=event.step,
         pairs=pairs,
         flips=flipped,
@@ -107,38 +107,38 @@ def _judged(plays: Iterable[Play]) -> FirstDifference | None:
         event, first, second = difference.event, difference.first, difference.second
         raise _leak(
             event,
-            f"{first.turn.item} has another {_VALUES[event.part]} at step {event.step} "
+            f"{first.planned.item} has another {_VALUES[event.component]} at step {event.step} "
             f"{second.circumstances} than {first.circumstances}; repeated, both are the same.",
         )
     return difference
 
 
 _VALUES = {
-    Origin.RETRIEVAL: "history",
-    Origin.SIMULATOR: "observation",
-    Origin.WRITER: "subgoal",
-    Origin.POLICY: "action",
+    Component.RETRIEVAL: "history",
+    Component.SIMULATOR: "observation",
+    Component.WRITER: "subgoal",
+    Component.POLICY: "action",
 }
 
 
 def _leak(event: Event, evidence: str) -> LeakError:
-    part = event.part.value
+    component = event.component.value
     return LeakError.of(
-        part,
+        component,
         event.step,
-        f"the {part} keeps a state from one rollout to the next. {evidence}",
+        f"the {component} keeps a state from one rollout to the next. {evidence}",
         f"Let its reset clear what is left: see {_PAGE}. {named('no_probe')} runs all the "
         "same, and is recorded.",
     )
 
 
 def _repeat(
-    run: RunContext[RunConfig], pool: WorkerPool, turns: tuple[PlannedPlay, ...], last: list[Play]
+    run: RunContext[RunConfig], pool: WorkerPool, planned: tuple[PlannedPlay, ...], last: list[Play]
 ) -> list[list[Play]]:
     """Play a sequence several times, each time with a new policy; `last` was played before."""
     repeats = [last]
     for _ in range(_REPEATS):
-        repeats.append(_play(run, pool, turns, after=repeats[-1][-1]))
+        repeats.append(_play(run, pool, planned, after=repeats[-1][-1]))
     return repeats[1:]
 
 
@@ -156,15 +156,15 @@ class _BrokenError(Exception):
 def _play(
     run: RunContext[RunConfig],
     pool: WorkerPool,
-    turns: tuple[PlannedPlay, ...],
+    planned: tuple[PlannedPlay, ...],
     *,
     after: Play | None = None,
     fresh: bool = True,
 ) -> list[Play]:
     """Let one worker play, beginning with a new policy or not; `after` is the last play before."""
-    limit = run.config.rollout_timeout_s * len(turns)
+    limit = run.config.rollout_timeout_s * len(planned)
     again = (SimulatorCrashError, ServerKeepaliveError, ServerDiedError)
-    (outcome,) = pool.run([ProbeTask(run, turns, fresh)], time_limit=limit, again=again)
+    (outcome,) = pool.run([ProbeTask(run, planned, fresh)], time_limit=limit, again=again)
     if isinstance(outcome.error, WorkerRetiredError):
         raise outcome.error
     if outcome.error is not None:
@@ -173,5 +173,5 @@ def _play(
         raise _BrokenError(text)
     first, *rest = outcome.value
     if after is not None:
-        first = replace(first, after=after.turn.label)
+        first = replace(first, after=after.planned.label)
     return [first, *rest]

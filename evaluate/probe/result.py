@@ -16,7 +16,7 @@ class Probe:
         rollouts: The rollouts that it repeated, such as `MoveCube/test/3 k7`.
         plays: How often it played one.
         clients: Clients of one policy that acted in turns: 2 where workers share policies.
-        part: Of a nondeterministic system, what gave the first different value: `policy`,
+        component: Of a nondeterministic system, what gave the first different value: `policy`,
             `simulator`, `subgoal writer` or `retrieval step`.
         step: Executed steps before that value.
         pairs: Of a nondeterministic system, pairs of plays of a rollout after the same predecessor.
@@ -29,7 +29,7 @@ class Probe:
     rollouts: tuple[str, ...]
     plays: int
     clients: int
-    part: str | None = None
+    component: str | None = None
     step: int | None = None
     pairs: int | None = None
     flips: int | None = None
@@ -66,8 +66,8 @@ def probe_text(probe: Probe | None) -> str:
             f"{100 * low:.0f} to {100 * high:.0f}) have another outcome"
         )
     return (
-        f"not deterministic: the {probe.part} differs from step {probe.step} on, and {flipped}; a "
-        f"leak larger than this noise was not found (p = {probe.p_value:.2g})"
+        f"not deterministic: the {probe.component} differs from step {probe.step} on, and "
+        f"{flipped}; a leak larger than this noise was not found (p = {probe.p_value:.2g})"
     )
 
 

@@ -16,7 +16,7 @@ from robomme_interference_data.simulators.episode import Observation
 from .plays import PlannedPlay
 
 
-class Origin(Enum):
+class Component(Enum):
     """What gives the values of a rollout."""
 
     RETRIEVAL = "retrieval step"
@@ -28,7 +28,7 @@ class Origin(Enum):
 class Event(NamedTuple):
     """A value in a rollout: what gave it, after how many steps, and a digest of it."""
 
-    part: Origin
+    component: Component
     step: int
     digest: bytes
 
@@ -51,34 +51,34 @@ class Trace:
 
     def received(self, frames: Sequence[int]) -> None:
         """Add which frames of the history the policy receives."""
-        self._add(Origin.RETRIEVAL, 0, np.array(frames, np.int64))
+        self._add(Component.RETRIEVAL, 0, np.array(frames, np.int64))
 
     def observed(self, step: int, observation: Observation) -> None:
         """Add an observation of the simulator."""
         images = [observation.images[name] for name in sorted(observation.images)]
-        self._add(Origin.SIMULATOR, step, *images, observation.state)
+        self._add(Component.SIMULATOR, step, *images, observation.state)
 
     def told(self, step: int, subgoal: Subgoal) -> None:
         """Add a subgoal."""
-        self._add(Origin.WRITER, step, np.frombuffer(subgoal.grounded.encode(), np.uint8))
+        self._add(Component.WRITER, step, np.frombuffer(subgoal.grounded.encode(), np.uint8))
 
     def acted(self, step: int, action: NDArray[np.float32]) -> None:
         """Add an action of the policy."""
         self.first_action = self.first_action or tuple(action.tolist())
-        self._add(Origin.POLICY, step, action)
+        self._add(Component.POLICY, step, action)
 
     def ended(self, step: int, status: str) -> None:
         """Add how the simulator ended the rollout."""
-        self._add(Origin.SIMULATOR, step, np.frombuffer(status.encode(), np.uint8))
+        self._add(Component.SIMULATOR, step, np.frombuffer(status.encode(), np.uint8))
 
-    def _add(self, part: Origin, step: int, *arrays: NDArray[Any]) -> None:
+    def _add(self, component: Component, step: int, *arrays: NDArray[Any]) -> None:
         if not self.collects:
             return
         digest = hashlib.sha256()
         for array in arrays:
             digest.update(f"{array.dtype.str}{array.shape}".encode())
             digest.update(np.ascontiguousarray(array))
-        self.events.append(Event(part, step, digest.digest()[:16]))
+        self.events.append(Event(component, step, digest.digest()[:16]))
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Play:
     """A rollout that the probe played.
 
     Attributes:
-        turn: What was played.
+        planned: What was played.
         past: Labels of what the same client played since it was new.
         after: Label of what the probe played just before; None at its beginning.
         events: The values.
@@ -94,7 +94,7 @@ class Play:
         status: How it ended; None if it was cut short.
     """
 
-    turn: PlannedPlay
+    planned: PlannedPlay
     past: tuple[str, ...]
     after: str | None
     events: tuple[Event, ...]
@@ -105,5 +105,5 @@ class Play:
     def circumstances(self) -> str:
         """What came before it, and what happened beside it, in words."""
         before = f"after {self.past[-1]}" if self.past else "with a new policy"
-        beside = self.turn.beside
+        beside = self.planned.beside
         return before + (f", while another client plays {beside.key}" if beside else "")

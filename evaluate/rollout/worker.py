@@ -182,27 +182,27 @@ class RolloutFunction(RunFunction[RunConfig]):
         if task.fresh and self._past:
             self.close()
         plays, calls = list[Play](), dict[WorkItem, Calls]()
-        for turn in task.turns:
-            trace = Trace(MAX_STEPS if turn.whole else SHORT_STEPS)
+        for planned in task.planned:
+            trace = Trace(MAX_STEPS if planned.whole else SHORT_STEPS)
             policy, past = self._open_policy(worker), tuple(self._past)
             with ExitStack() as stack:
-                if turn.beside is not None:
+                if planned.beside is not None:
                     other = stack.enter_context(closing(self._make_policy(worker, client=1)))
-                    policy = Interleaved(policy, other, calls[turn.beside])
-                elif any(turn.item == later.beside for later in task.turns):
-                    policy = Recorder(policy, calls.setdefault(turn.item, []))
+                    policy = Interleaved(policy, other, calls[planned.beside])
+                elif any(planned.item == later.beside for later in task.planned):
+                    policy = Recorder(policy, calls.setdefault(planned.item, []))
                 try:
-                    job = Job(turn.item, task.run)
-                    row = self._roll(job, worker, policy=policy, trace=trace, label=turn.label)
+                    job = Job(planned.item, task.run)
+                    row = self._roll(job, worker, policy=policy, trace=trace, label=planned.label)
                 except Exception as error:
                     self._check_reachable(error, worker)
                     raise
-            ended = turn.whole or row.steps < SHORT_STEPS
+            ended = planned.whole or row.steps < SHORT_STEPS
             plays.append(
                 Play(
-                    turn,
+                    planned,
                     past,
-                    plays[-1].turn.label if plays else None,
+                    plays[-1].planned.label if plays else None,
                     tuple(trace.events),
                     trace.first_action,
                     row.status if ended else None,

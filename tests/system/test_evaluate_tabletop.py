@@ -124,7 +124,7 @@ def test_a_policy_that_keeps_its_path_is_an_error_before_the_run(
 
     with pytest.raises(LeakError) as raised:
         probe("Leaky")
-    assert (raised.value.part, raised.value.step) == ("policy", 0)
+    assert (raised.value.component, raised.value.step) == ("policy", 0)
     found = probe("Retrace")
     assert found is not None and found.verdict == "independent"
 
