@@ -259,7 +259,7 @@ class LeakError(InterferenceError, RuntimeError):
 
     @classmethod
     def of(cls, component: str, step: int, message: str, hint: str) -> Self:
-        """Return the error for a component that keeps a state, seen after so many steps."""
+        """Return the error for a component that keeps a state, found after so many steps."""
         error = cls(message, hint)
         error.component, error.step = component, step
         return error

@@ -1,7 +1,7 @@
 """What the leak probe plays: which rollouts, and in which order."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from robomme_interference_data.evaluate.run.config import RunConfig
@@ -40,23 +40,29 @@ class PlannedPlay:
         return self.item.key + ("" if self.whole else f" ({SHORT_STEPS} steps{beside})")
 
 
-def sequence(items: Sequence[WorkItem], *, clients: int) -> tuple[PlannedPlay, ...]:
+def sequence(
+    items: Sequence[WorkItem], moves: Callable[[WorkItem], bool], *, clients: int
+) -> tuple[PlannedPlay, ...]:
     """Return what the probe plays, in this order, with one policy; each time with the same past.
 
     The first rollout comes with a new policy, and after another rollout, which has the longest
-    history and so leaves most behind. Runs of `ENOUGH_ROLLOUTS` or more play that one to its end,
+    history and so leaves most behind; a history of a robot that stands still may leave nothing that
+    shows. Runs of `ENOUGH_ROLLOUTS` or more play that one to its end,
     too: some states are left only then. With several clients of one policy, another client acts
     between the calls of the last play.
 
     Args:
         items: The planned rollouts, at least one.
+        moves: Whether the robot moves in the lesson of a rollout.
         clients: Number of workers that one policy or server serves.
     """
     ordered = shuffle_work(items)
-    first = min(ordered, key=_history_rank)
-    others = [item for item in ordered if item.episode.family != first.episode.family]
-    others = others or [item for item in ordered if item.episode != first.episode] or [*ordered]
-    second = max(others, key=_history_rank)
+    most = max(map(_history_rank, ordered))
+    longest = [item for item in ordered if _history_rank(item) == most]
+    second = next(filter(moves, longest), longest[0])
+    others = [item for item in ordered if item.episode.family != second.episode.family]
+    others = others or [item for item in ordered if item.episode != second.episode] or [*ordered]
+    first = min(others, key=_history_rank)
     planned = [PlannedPlay(first), PlannedPlay(second), PlannedPlay(first)]
     if len(items) >= ENOUGH_ROLLOUTS:
         planned += [PlannedPlay(second, whole=True), PlannedPlay(first)]

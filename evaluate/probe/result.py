@@ -1,7 +1,7 @@
 """What a run records of its leak probe, and how it is reported."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from robomme_interference_data.stats.intervals import wilson
 
@@ -22,7 +22,11 @@ class Probe:
         pairs: Of a nondeterministic system, pairs of plays of a rollout after the same predecessor.
         flips: Pairs of these with another outcome.
         p_value: Of a nondeterministic system, probability of its plays without a leak.
+        digest: Of a nondeterministic system, a digest of the values of its first plays. If the
+            system gives the same one whenever it is started again, it is no noise that makes it
+            differ, but a state that every rollout changes.
         error: Of a broken probe, why.
+        unprobed: Of a merged run, the folders that were not probed.
     """
 
     verdict: str
@@ -34,12 +38,19 @@ class Probe:
     pairs: int | None = None
     flips: int | None = None
     p_value: float | None = None
+    digest: str | None = None
     error: str | None = None
+    unprobed: tuple[str, ...] = ()
 
     @property
     def done(self) -> bool:
         """Whether it need not be repeated."""
         return self.verdict != BROKEN
+
+    @property
+    def all_independent(self) -> bool:
+        """Whether all of the run was probed, and no state survives a reset."""
+        return self.verdict == INDEPENDENT and not self.unprobed
 
 
 INDEPENDENT, NONDETERMINISTIC, BROKEN = "independent", "nondeterministic", "broken"
@@ -49,14 +60,21 @@ def probe_text(probe: Probe | None) -> str:
     """Return what a probe found, in a sentence."""
     if probe is None:
         return "not probed: whether a state survives a reset is unknown"
+    unprobed = f"; not probed: {', '.join(probe.unprobed)}" if probe.unprobed else ""
     if probe.verdict == BROKEN:
-        return f"not probed, as a rollout of the probe broke: {probe.error}"
-    if probe.verdict == INDEPENDENT:
+        text = f"not probed, as a rollout of the probe broke: {probe.error}"
+    elif probe.verdict == INDEPENDENT:
         beside = ", and while another client acts" if probe.clients > 1 else ""
-        return (
+        text = (
             f"no state survives a reset: {len({*probe.rollouts})} rollouts, {probe.plays} plays, "
             f"the same values after any predecessor{beside}"
         )
+    else:
+        text = _noise_text(probe)
+    return text + unprobed
+
+
+def _noise_text(probe: Probe) -> str:
     pairs, flips = probe.pairs or 0, probe.flips or 0
     flipped = "no rollout was repeated under the same conditions"
     if pairs:
@@ -67,14 +85,19 @@ def probe_text(probe: Probe | None) -> str:
         )
     return (
         f"not deterministic: the {probe.component} differs from step {probe.step} on, and "
-        f"{flipped}; a leak larger than this noise was not found (p = {probe.p_value:.2g})"
+        f"{flipped}; a leak larger than this noise was not found (p = {probe.p_value:.2g}). If its "
+        f"first values have the digest {(probe.digest or '')[:8]} again after every restart, it "
+        "keeps a state that all rollouts change"
     )
 
 
-def joined_probe(probes: Sequence[Probe | None]) -> Probe | None:
-    """Return the probe that claims least; None if a shard was not probed."""
+def joined_probe(shards: Sequence[tuple[str, Probe | None]]) -> Probe | None:
+    """Return the probe of merged folders that claims least; None if no folder was probed."""
     order = (BROKEN, NONDETERMINISTIC, INDEPENDENT)
-    known = [probe for probe in probes if probe is not None]
-    if len(known) < len(probes):
+    known = [probe for _, probe in shards if probe is not None]
+    if not known:
         return None
-    return min(known, key=lambda probe: order.index(probe.verdict), default=None)
+    unprobed = [name for name, probe in shards if probe is None]
+    unprobed += [name for probe in known for name in probe.unprobed]
+    weakest = min(known, key=lambda probe: order.index(probe.verdict))
+    return replace(weakest, unprobed=tuple(unprobed))

@@ -1,7 +1,8 @@
 """What the leak probe compares: the values of a rollout, as digests."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, NamedTuple
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import MAX_STEPS
+from robomme_interference_data.errors import InterferenceError, first_line
 from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.episode import Observation
 
@@ -42,12 +44,14 @@ class Trace:
         collects: Whether it collects anything: digests of images take time.
         events: The values.
         first_action: The first action; empty before it.
+        error: The exception that ended the rollout, in a line, if a component raised it.
     """
 
     most_steps: int = MAX_STEPS
     collects: bool = True
     events: list[Event] = field(default_factory=list)
     first_action: tuple[float, ...] = ()
+    error: str | None = None
 
     def received(self, frames: Sequence[int]) -> None:
         """Add which frames of the history the policy receives."""
@@ -71,6 +75,17 @@ class Trace:
         """Add how the simulator ended the rollout."""
         self._add(Component.SIMULATOR, step, np.frombuffer(status.encode(), np.uint8))
 
+    @contextmanager
+    def errors_of(self, component: Component, step: int = 0) -> Iterator[None]:
+        """Add an exception of the block, which is a value of a component like others."""
+        try:
+            yield
+        except Exception as error:
+            known = isinstance(error, InterferenceError)
+            self.error = error.message if known else first_line(error)
+            self._add(component, step, np.frombuffer(self.error.encode(), np.uint8))
+            raise
+
     def _add(self, component: Component, step: int, *arrays: NDArray[Any]) -> None:
         if not self.collects:
             return
@@ -91,7 +106,8 @@ class Play:
         after: Label of what the probe played just before; None at its beginning.
         events: The values.
         first_action: The first action.
-        status: How it ended; None if it was cut short.
+        status: How it ended; None if it was cut short or broke.
+        error: Why it broke, although nothing breaks it with a new policy; None if it did not.
     """
 
     planned: PlannedPlay
@@ -100,6 +116,7 @@ class Play:
     events: tuple[Event, ...]
     first_action: tuple[float, ...] = ()
     status: str | None = None
+    error: str | None = None
 
     @property
     def circumstances(self) -> str:
@@ -107,3 +124,9 @@ class Play:
         before = f"after {self.past[-1]}" if self.past else "with a new policy"
         beside = self.planned.beside
         return before + (f", while another client plays {beside.key}" if beside else "")
+
+
+def digest_of(plays: Sequence[Play]) -> str:
+    """Return a digest of all values of plays."""
+    events = (event for play in plays for event in play.events)
+    return hashlib.sha256(b"".join(event.digest for event in events)).hexdigest()

@@ -74,7 +74,9 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
         plans=tuple(plan for place, plan in enumerate(plans) if plan not in plans[:place]),
         invocations=tuple(start for header in headers for start in header.invocations),
         merged=tuple(folder.name for folder in folders),
-        probe=joined_probe([header.probe for header in headers]),
+        probe=joined_probe(
+            [(folder.name, header.probe) for folder, header in zip(folders, headers, strict=True)]
+        ),
     )
     videos = [(folder, row.video) for row, folder in merged.values() if row.video]
     # `path` refuses links that lead out of the folder.

@@ -10,7 +10,7 @@ from typing import Any
 
 from robomme_interference_data.constants import MAX_ROW_BYTES, QUESTIONS
 from robomme_interference_data.errors import FormatError
-from robomme_interference_data.evaluate.probe.result import INDEPENDENT, Probe, probe_text
+from robomme_interference_data.evaluate.probe.result import Probe, probe_text
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.storage.text import read_bytes
 
@@ -90,8 +90,8 @@ class RunHeader:
 
     @property
     def probe_note(self) -> str | None:
-        """A sentence for readers of scores, if the probe found anything but independence."""
-        if self.probe is None or self.probe.verdict == INDEPENDENT:
+        """A sentence for readers of scores, unless all was probed and no state survives a reset."""
+        if self.probe is None or self.probe.all_independent:
             return None
         return f"Leak probe of {self.identity.get('system')}: {probe_text(self.probe)}."
 

@@ -12,6 +12,11 @@ from typing import TYPE_CHECKING, Any
 from robomme_interference_data.constants import PROTOCOL_VERSION
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
+from robomme_interference_data.errors import (
+    ServerDiedError,
+    ServerKeepaliveError,
+    SimulatorCrashError,
+)
 from robomme_interference_data.evaluate.policies.registry import policy_kind
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.runtime.executor import Worker
@@ -25,6 +30,10 @@ from .row import Rollout
 
 if TYPE_CHECKING:
     from robomme_interference_data.retrieval.selector import Selector
+
+
+WORTH_REPEATING = (SimulatorCrashError, ServerKeepaliveError, ServerDiedError)
+"""Errors after which a rollout is tried again, as those of a process and not of the rollout."""
 
 
 @dataclass(frozen=True)
