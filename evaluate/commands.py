@@ -116,9 +116,9 @@ def _run(config: RunConfig | AskConfig, kept: str, unit: str, *, as_json: bool) 
     """Run, and print the results; exit with 1 after errors."""
     from robomme_interference_data.schema.codec import to_dict
 
+    from .probe.result import probe_text
     from .run.evaluation import run_evaluation
     from .run.progress import RunProgress, error_table, rate_table
-    from .run.record import INDEPENDENT, probe_text
 
     check_output(config.out)
     offline = isinstance(config, RunConfig) and config.offline
@@ -128,7 +128,7 @@ def _run(config: RunConfig | AskConfig, kept: str, unit: str, *, as_json: bool) 
     ):
         result = run_evaluation(config, progress=shown, command=[command_line()])
     if as_json:
-        if result.probe is not None and result.probe.verdict != INDEPENDENT:
+        if result.probe is not None and not result.probe.all_independent:
             print_status(probe_text(result.probe))  # else it is printed before the rows
         print_json([to_dict(row) for row in result.rows])
     else:

@@ -249,19 +249,19 @@ class LeakError(InterferenceError, RuntimeError):
     Fix: let its reset clear what is left: docs/how-to/your-own-policy.md.
 
     Attributes:
-        part: What gave the first different value: `policy`, `simulator`, `subgoal writer` or
+        component: What gave the first different value: `policy`, `simulator`, `subgoal writer` or
             `retrieval step`.
         step: Executed steps before it.
     """
 
-    part: str = ""
+    component: str = ""
     step: int = 0
 
     @classmethod
-    def of(cls, part: str, step: int, message: str, hint: str) -> Self:
-        """Return the error for a part that keeps a state, seen after so many steps."""
+    def of(cls, component: str, step: int, message: str, hint: str) -> Self:
+        """Return the error for a component that keeps a state, found after so many steps."""
         error = cls(message, hint)
-        error.part, error.step = part, step
+        error.component, error.step = component, step
         return error
 
 

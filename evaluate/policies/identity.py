@@ -33,6 +33,7 @@ from .registry import (
     server_addresses,
     starts_server,
 )
+from .server_lock import lock_server
 
 logger = logging.getLogger(__name__)
 
@@ -43,14 +44,10 @@ MAX_METADATA = 1 << 16
 @contextmanager
 def lock_servers(text: str, out: Path) -> Iterator[None]:
     """Keep other runs from a policy's servers in the block; `out` is this run's folder."""
-    addresses = server_addresses(text) if one_client(text) else ()
+    holder = f"the run in {out.resolve()}"
     with ExitStack() as stack:
-        if addresses:
-            from .server_lock import lock_server
-
-            holder = f"the run in {out.resolve()}"
-            for server in addresses:
-                stack.enter_context(lock_server(server.host, server.port, holder))
+        for server in server_addresses(text):
+            stack.enter_context(lock_server(server.host, server.port, holder))
         yield
 
 
@@ -75,7 +72,7 @@ def describe_policy(
     policy, metadata = policies[0], dict(reports[0])
     if server_addresses(text):
         # Of a vla-eval server this is known only after its hello.
-        if getattr(policy, "one_client", False):
+        if metadata.get("one_client"):
             check_workers(text, workers)
         check_metadata(reports, policy_options(text, options)["checkpoint"])
         metadata["server"] = ", ".join(reported["server"] for reported in reports)

@@ -252,7 +252,7 @@ KINDS: dict[str, PolicyKind] = {
         extra="vla-eval",
         not_in_identity=_SERVER_OPTIONS,
         valid=_valid_addresses,
-        # Some servers have one client: their hello shows it, see `VlaEvalPolicy.one_client`.
+        # Some servers have one client: their hello shows it, see `VlaEvalPolicy.metadata`.
         server=Server(one_client=False, starter=None),
         packages=("vla-eval",),
     ),

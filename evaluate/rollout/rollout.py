@@ -17,11 +17,11 @@ from robomme_interference_data.data.buffer import Buffer, Chunk
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import InvalidOptionError, PolicyError, RunError
 from robomme_interference_data.evaluate.policies.policy import Policy, RolloutInfo
+from robomme_interference_data.evaluate.probe.trace import Component, Trace
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.history import HistoryReader, history_columns
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout, model_columns
-from robomme_interference_data.evaluate.run.traces import Trace
 from robomme_interference_data.evaluate.run.worker import RunContext
 from robomme_interference_data.evaluate.systems import check_history, name_system
 from robomme_interference_data.runtime.executor import Worker
@@ -90,15 +90,16 @@ def run_rollout(
     received: Sequence[int] = range(len(buffer))
     trace = trace or Trace(collects=False)
     limit = worker.limit(config.simulator_timeout_s, "the simulator's reset")
-    with clock.part("reset_s"), limit:
-        demonstration, first, info = simulator.reset(
-            str(item.episode), demonstration=config.check_lesson
-        )
-    check_episode(buffer.query, demonstration, first, info)
+    with trace.errors_of(Component.SIMULATOR):
+        with clock.part("reset_s"), limit:
+            demonstration, first, info = simulator.reset(
+                str(item.episode), demonstration=config.check_lesson
+            )
+        check_episode(buffer.query, demonstration, first, info)
+        if config.check_lesson:
+            # Under a shift the first live view differs from the recorded one.
+            check_lesson(buffer.query, demonstration, first, views=config.shift == NO_SHIFT)
     trace.observed(0, first)
-    if config.check_lesson:
-        # Under a shift the first live view differs from the recorded one.
-        check_lesson(buffer.query, demonstration, first, views=config.shift == NO_SHIFT)
     if selector is not None and len(buffer):
         with clock.part("history_s"):
             camera = buffer.query.dataset.camera(selector.camera)
@@ -111,7 +112,11 @@ def run_rollout(
     if policy.privileged:
         evidence = buffer.evidence and evidence_among(buffer.evidence, received)
         rollout_info = replace(rollout_info, simulator=simulator, evidence=evidence, answer=answer)
-    with clock.part("history_s"), _decode(reader, buffer, received, policy, config) as chunks:
+    with (
+        clock.part("history_s"),
+        _decode(reader, buffer, received, policy, config) as chunks,
+        trace.errors_of(Component.POLICY),
+    ):
         policy.reset(rollout_info)
         for chunk in chunks:
             policy.add_history(chunk.frames, chunk.states, len(received))
@@ -192,7 +197,8 @@ class _Live:
                         subgoal, written = self.writer.next(seen[-1], self.steps), self.steps
                         self.trace.told(self.steps, subgoal)
                 seen[-1] = replace(seen[-1], subgoal=subgoal)
-            actions = self._decide(seen, goal)[: most_steps - self.steps]
+            with self.trace.errors_of(Component.POLICY, self.steps):
+                actions = self._decide(seen, goal)[: most_steps - self.steps]
             seen = []
             with self.worker.limit(self.config.simulator_timeout_s, "the simulator's steps"):
                 for number, action in enumerate(actions, 1):
@@ -200,7 +206,10 @@ class _Live:
                     drawn = needed or self.clip is not None
                     self.sent.update(action.astype("<f4").tobytes())
                     self.trace.acted(self.steps, action)
-                    with self.clock.part("simulator_s"):
+                    with (
+                        self.clock.part("simulator_s"),
+                        self.trace.errors_of(Component.SIMULATOR, self.steps),
+                    ):
                         observed, status = self.simulator.step(action, observe=drawn)
                     self.steps += 1
                     if self.clip is not None:

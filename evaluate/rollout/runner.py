@@ -3,7 +3,7 @@
 import dataclasses
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,7 @@ from robomme_interference_data.evaluate.policies.kinds import Role
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import (
     POLICIES,
+    one_client,
     policy_kind,
     policy_options,
     starts_server,
@@ -66,9 +67,15 @@ def open_rollouts(
     config: RunConfig, buffer_set: BufferSet, executor: Executor
 ) -> Iterator[tuple[PlannedRun[RunConfig], WorkerPool | None]]:
     """Plan a run, and keep its workers in the block; None if there is nothing to do for them."""
-    # A server may hold one memory: no other run may use it until this one has ended.
-    with lock_servers(config.policy, Path(config.out)):
+    locked = lock_servers(config.policy, Path(config.out))
+    with ExitStack() as stack:
+        # A server may hold one memory: no other run may use it until this one has ended.
+        if one_client(config.policy):
+            stack.enter_context(locked)
         planned = plan_rollouts(config, buffer_set)
+        # Of a vla-eval server this is known only after its hello.
+        if planned.run.metadata.get("one_client"):
+            stack.enter_context(locked)
         run, items = planned.run, planned.items
         if note := renderers_note(run.identity["renderers"].items()):
             logger.warning(note)

@@ -19,11 +19,18 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.evaluate.policies.policy import Policy
 from robomme_interference_data.evaluate.policies.registry import make_policy, starts_server
+from robomme_interference_data.evaluate.probe.clients import Calls, Interleaved, Recorder
+from robomme_interference_data.evaluate.probe.plays import SHORT_STEPS, PlannedPlay, ProbeTask
+from robomme_interference_data.evaluate.probe.trace import Play, Trace
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.row import Rollout
-from robomme_interference_data.evaluate.run.traces import SHORT_STEPS, Play, Trace
-from robomme_interference_data.evaluate.run.worker import Job, ProbeTask, RunFunction
+from robomme_interference_data.evaluate.run.worker import (
+    WORTH_REPEATING,
+    Job,
+    RunContext,
+    RunFunction,
+)
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
 from robomme_interference_data.schema.codec import to_dict
@@ -37,7 +44,6 @@ from robomme_interference_data.simulators.registry import (
 )
 
 from .checks import check_episode
-from .clients import Calls, Interleaved, Recorder
 from .rollout import run_rollout
 from .settings import simulator_options, used_cameras
 
@@ -177,38 +183,56 @@ class RolloutFunction(RunFunction[RunConfig]):
         return row, clip.problem if clip else None
 
     def _probe(self, task: ProbeTask, worker: Worker) -> list[Play]:
-        """Play rollouts one after the other, and return their values."""
+        """Play rollouts one after the other, and return their values.
+
+        One that breaks is played once more, with everything new: if it does not break then, a state
+        may have broken it.
+        """
         if task.fresh and self._past:
             self.close()
-        plays, calls = list[Play](), dict[WorkItem, Calls]()
-        for turn in task.turns:
-            trace = Trace(MAX_STEPS if turn.whole else SHORT_STEPS)
-            policy, past = self._open_policy(worker), tuple(self._past)
-            with ExitStack() as stack:
-                if turn.beside is not None:
-                    other = stack.enter_context(closing(self._make_policy(worker, client=1)))
-                    policy = Interleaved(policy, other, calls[turn.beside])
-                elif any(turn.item == later.beside for later in task.turns):
-                    policy = Recorder(policy, calls.setdefault(turn.item, []))
-                try:
-                    job = Job(turn.item, task.run)
-                    row = self._roll(job, worker, policy=policy, trace=trace, label=turn.label)
-                except Exception as error:
-                    self._check_reachable(error, worker)
-                    raise
-            ended = turn.whole or row.steps < SHORT_STEPS
-            plays.append(
-                Play(
-                    turn,
-                    past,
-                    plays[-1].turn.label if plays else None,
-                    tuple(trace.events),
-                    trace.first_action,
-                    row.status if ended else None,
-                )
-            )
+        plays = list[Play]()
+        calls: dict[WorkItem, Calls] = {
+            planned.beside: [] for planned in task.planned if planned.beside is not None
+        }
+        for planned in task.planned:
+            after = plays[-1].planned.label if plays else None
+            plays.append(self._play(task.run, planned, calls, after, worker))
+            if plays[-1].error is not None:
+                self.close()
+                plays.append(self._play(task.run, planned, calls, planned.label, worker))
         self._logs.clear()
         return plays
+
+    def _play(
+        self,
+        run: RunContext[RunConfig],
+        planned: PlannedPlay,
+        calls: dict[WorkItem, Calls],
+        after: str | None,
+        worker: Worker,
+    ) -> Play:
+        """Play a rollout for the probe; `calls` holds those of rollouts that act beside others."""
+        trace = Trace(MAX_STEPS if planned.whole else SHORT_STEPS)
+        policy, past, status = self._open_policy(worker), tuple(self._past), None
+        with ExitStack() as stack:
+            if planned.beside is not None:
+                other = stack.enter_context(closing(self._make_policy(worker, client=1)))
+                policy = Interleaved(policy, other, calls[planned.beside])
+            elif planned.item in calls:
+                policy = Recorder(policy, calls[planned.item])
+            try:
+                job = Job(planned.item, run)
+                row = self._roll(job, worker, policy=policy, trace=trace, label=planned.label)
+                if planned.whole or row.steps < SHORT_STEPS:
+                    status = row.status
+            except Exception as error:
+                self._check_reachable(error, worker)
+                # What breaks with everything new breaks without any state.
+                if trace.error is None or not past or isinstance(error, WORTH_REPEATING):
+                    raise
+        return Play(
+            planned, past, after, tuple(trace.events), trace.first_action, status, trace.error
+        )
 
     def _roll(
         self,

@@ -23,14 +23,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
-from robomme_interference_data.errors import (
-    InterferenceError,
-    NoRendererError,
-    ServerDiedError,
-    ServerKeepaliveError,
-    SimulatorCrashError,
-    first_line,
-)
+from robomme_interference_data.errors import InterferenceError, NoRendererError, first_line
+from robomme_interference_data.evaluate.probe.result import Probe, probe_text
 from robomme_interference_data.runtime.executor import (
     Executor,
     Outcome,
@@ -47,9 +41,8 @@ from .faults import error_text, first_fault, first_trace
 from .identity import invocation, now, plain, run_identity
 from .log import RunLog, count_statuses, open_log
 from .plan import WorkItem, shuffle_work
-from .record import Probe, probe_text
 from .row import Rollout, is_done, row_line, row_of
-from .worker import Job, PlannedRun, RunContext
+from .worker import WORTH_REPEATING, Job, PlannedRun, RunContext
 
 if TYPE_CHECKING:
     import pandas
@@ -156,7 +149,7 @@ def run_evaluation(
         log = stack.enter_context(
             open_log(folder, identity, buffer_set.name, resume=not config.no_resume)
         )
-        probe = _probe(run, planned.items, pool, log, progress)
+        probe = _probe(run, buffer_set, planned.items, pool, log, progress)
         log.begin(invocation(run, plan, command), probe)
         # The buffer set may have moved to another folder: its label in rows stays the same.
         run = dataclasses.replace(run, buffer_set=log.header.buffer_set)
@@ -185,6 +178,7 @@ def _open_run(
 
 def _probe(
     run: RunContext[Any],
+    buffer_set: BufferSet,
     items: Sequence[WorkItem],
     pool: WorkerPool | None,
     log: RunLog,
@@ -196,10 +190,11 @@ def _probe(
         return None
     if pool is None or all(item in log.rows and is_done(log.rows[item]) for item in items):
         return None
-    from .probe import probe_run  # questions have none
+    # Here, because questions have no probe.
+    from robomme_interference_data.evaluate.probe.probe import probe_run
 
     note = (lambda text: None) if progress is None else progress.note
-    probe = probe_run(run, items, pool, note)
+    probe = probe_run(run, buffer_set, items, pool, note)
     note(probe_text(probe))
     return probe
 
@@ -254,8 +249,7 @@ def _outcomes(
     run: RunContext[Any], pool: WorkerPool | None, items: Iterable[WorkItem]
 ) -> Generator[Outcome]:
     """Yield the outcomes of work items as they arrive; none without workers."""
-    again: tuple[type[Exception], ...]
-    again = (SimulatorCrashError, ServerKeepaliveError, ServerDiedError)
+    again: tuple[type[Exception], ...] = WORTH_REPEATING
     if isinstance(run.config, RunConfig) and run.config.policies is not None:
         # A shared policy that hangs delays all its rollouts: which of them it hung at is unknown.
         again += (TimeoutError,)

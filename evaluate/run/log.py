@@ -18,6 +18,7 @@ import pyarrow.parquet as pq
 
 from robomme_interference_data.constants import FORMAT_VERSION, RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.errors import RunError, named, visible
+from robomme_interference_data.evaluate.probe.result import Probe
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
 from robomme_interference_data.schema.rollouts import FINAL, Status
 from robomme_interference_data.storage.csv_text import quoted_table
@@ -27,7 +28,7 @@ from robomme_interference_data.storage.staging import file_lock
 from robomme_interference_data.storage.text import read_header
 
 from .plan import WorkItem
-from .record import Invocation, Probe, RunHeader, whole_lines
+from .record import Invocation, RunHeader, whole_lines
 from .row import Rollout, is_done, read_record, row_line
 
 ERRORS_LOG = "errors.log"

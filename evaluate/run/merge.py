@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from robomme_interference_data.errors import RunError
+from robomme_interference_data.evaluate.probe.result import joined_probe
 from robomme_interference_data.schema.rollouts import TIMING_COLUMNS
 from robomme_interference_data.storage.files import LocalFiles
 
 from .log import ERRORS_LOG, check_same_run, open_log, read_run
 from .plan import WorkItem
-from .record import joined_probe
 from .row import Rollout, is_done
 
 
@@ -74,7 +74,9 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
         plans=tuple(plan for place, plan in enumerate(plans) if plan not in plans[:place]),
         invocations=tuple(start for header in headers for start in header.invocations),
         merged=tuple(folder.name for folder in folders),
-        probe=joined_probe([header.probe for header in headers]),
+        probe=joined_probe(
+            [(folder.name, header.probe) for folder, header in zip(folders, headers, strict=True)]
+        ),
     )
     videos = [(folder, row.video) for row, folder in merged.values() if row.video]
     # `path` refuses links that lead out of the folder.

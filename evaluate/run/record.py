@@ -10,8 +10,8 @@ from typing import Any
 
 from robomme_interference_data.constants import MAX_ROW_BYTES, QUESTIONS
 from robomme_interference_data.errors import FormatError
+from robomme_interference_data.evaluate.probe.result import Probe, probe_text
 from robomme_interference_data.schema.rollouts import Status
-from robomme_interference_data.stats.intervals import wilson
 from robomme_interference_data.storage.text import read_bytes
 
 from .plan import RunPlan, WorkItem
@@ -44,80 +44,6 @@ class Invocation:
     started: str
     ended: str | None = None
     stopped: str | None = None
-
-
-@dataclass(frozen=True)
-class Probe:
-    """What the leak probe found before the first row: see `traces.py`. A leak leaves no run.
-
-    Attributes:
-        verdict: `independent`: the same values after any predecessor. `nondeterministic`: other
-            values after the same predecessor, too. `broken`: a rollout of the probe broke.
-        rollouts: The rollouts that it repeated, such as `MoveCube/test/3 k7`.
-        plays: How often it played one.
-        clients: Clients of one policy that acted in turns: 2 where workers share policies.
-        part: Of a nondeterministic system, what gave the first different value: `policy`,
-            `simulator`, `subgoal writer` or `retrieval step`.
-        step: Executed steps before that value.
-        pairs: Of a nondeterministic system, pairs of plays of a rollout after the same predecessor.
-        flips: Pairs of these with another outcome.
-        p_value: Of a nondeterministic system, probability of its plays without a leak.
-        error: Of a broken probe, why.
-    """
-
-    verdict: str
-    rollouts: tuple[str, ...]
-    plays: int
-    clients: int
-    part: str | None = None
-    step: int | None = None
-    pairs: int | None = None
-    flips: int | None = None
-    p_value: float | None = None
-    error: str | None = None
-
-    @property
-    def done(self) -> bool:
-        """Whether it need not be repeated."""
-        return self.verdict != BROKEN
-
-
-INDEPENDENT, NONDETERMINISTIC, BROKEN = "independent", "nondeterministic", "broken"
-
-
-def probe_text(probe: Probe | None) -> str:
-    """Return what a probe found, in a sentence."""
-    if probe is None:
-        return "not probed: whether a state survives a reset is unknown"
-    if probe.verdict == BROKEN:
-        return f"not probed, as a rollout of the probe broke: {probe.error}"
-    if probe.verdict == INDEPENDENT:
-        beside = ", and while another client acts" if probe.clients > 1 else ""
-        return (
-            f"no state survives a reset: {len({*probe.rollouts})} rollouts, {probe.plays} plays, "
-            f"the same values after any predecessor{beside}"
-        )
-    pairs, flips = probe.pairs or 0, probe.flips or 0
-    flipped = "no rollout was repeated under the same conditions"
-    if pairs:
-        low, high = wilson(flips, pairs)
-        flipped = (
-            f"{flips} of {pairs} repeated rollouts ({flips / pairs:.1%}, 95% interval "
-            f"{100 * low:.0f} to {100 * high:.0f}) have another outcome"
-        )
-    return (
-        f"not deterministic: the {probe.part} differs from step {probe.step} on, and {flipped}; a "
-        f"leak larger than this noise was not found (p = {probe.p_value:.2g})"
-    )
-
-
-def joined_probe(probes: Sequence[Probe | None]) -> Probe | None:
-    """Return the probe that claims least; None if a shard was not probed."""
-    order = (BROKEN, NONDETERMINISTIC, INDEPENDENT)
-    known = [probe for probe in probes if probe is not None]
-    if len(known) < len(probes):
-        return None
-    return min(known, key=lambda probe: order.index(probe.verdict), default=None)
 
 
 @dataclass(frozen=True)
@@ -164,8 +90,8 @@ class RunHeader:
 
     @property
     def probe_note(self) -> str | None:
-        """A sentence for readers of scores, if the probe found anything but independence."""
-        if self.probe is None or self.probe.verdict == INDEPENDENT:
+        """A sentence for readers of scores, unless all was probed and no state survives a reset."""
+        if self.probe is None or self.probe.all_independent:
             return None
         return f"Leak probe of {self.identity.get('system')}: {probe_text(self.probe)}."
 

@@ -12,6 +12,11 @@ from typing import TYPE_CHECKING, Any
 from robomme_interference_data.constants import PROTOCOL_VERSION
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
+from robomme_interference_data.errors import (
+    ServerDiedError,
+    ServerKeepaliveError,
+    SimulatorCrashError,
+)
 from robomme_interference_data.evaluate.policies.registry import policy_kind
 from robomme_interference_data.evaluate.systems import SystemFacts
 from robomme_interference_data.runtime.executor import Worker
@@ -22,10 +27,13 @@ from .config import AskConfig, RetrievalConfig, RunConfig
 from .history import HistoryReader
 from .plan import RunPlan, WorkItem
 from .row import Rollout
-from .traces import PlannedPlay
 
 if TYPE_CHECKING:
     from robomme_interference_data.retrieval.selector import Selector
+
+
+WORTH_REPEATING = (SimulatorCrashError, ServerKeepaliveError, ServerDiedError)
+"""Errors after which a rollout is tried again, as those of a process and not of the rollout."""
 
 
 def reported_number(metadata: Mapping[str, Any], name: str) -> int | None:
@@ -130,21 +138,6 @@ class Job[C: RunConfig | AskConfig]:
 
     item: WorkItem
     run: RunContext[C]
-
-
-@dataclass(frozen=True)
-class ProbeTask:
-    """Rollouts that a worker plays for the leak probe, one after the other; it returns `Play`s.
-
-    Attributes:
-        run: Their run.
-        turns: What to play.
-        fresh: Whether to begin with a policy, simulator and subgoal writer that played nothing.
-    """
-
-    run: RunContext[RunConfig]
-    turns: tuple[PlannedPlay, ...]
-    fresh: bool
 
 
 def make_selector(config: RetrievalConfig) -> "Selector | None":

@@ -38,9 +38,6 @@ class VlaEvalPolicy(ObservingPolicy):
         response_s: Maximum seconds from a message to the end of its answer.
         other_states: What the server gets of the states of units of another robot, see
             `Policy.other_states`.
-
-    Attributes:
-        one_client: Whether the server is known to hold one memory for all its connections.
     """
 
     def __init__(
@@ -71,7 +68,7 @@ class VlaEvalPolicy(ObservingPolicy):
         self.cameras = ("front", "wrist") if wrist else ("front",)
         self.history_cameras = self.cameras if history else ()
         self.wants_history = bool(history)
-        self.one_client = self.wants_history and hello["model_server"] in _ONE_CLIENT
+        self._one_client = self.wants_history and hello["model_server"] in _ONE_CLIENT
 
     def reset(self, info: RolloutInfo) -> None:
         """Start an episode, connecting first, or again if the connection was lost."""
@@ -90,9 +87,13 @@ class VlaEvalPolicy(ObservingPolicy):
         return np.atleast_2d(self._server.act(self.message(observation, goal)))
 
     def metadata(self) -> dict[str, Any]:
-        """Return the server's address and its hello."""
-        name = self._server.name
-        return {"policy": "vla-eval", "server": name, "server_metadata": self._hello}
+        """Return the server's address, its hello, and if it is known to have one memory only."""
+        return {
+            "policy": "vla-eval",
+            "server": self._server.name,
+            "one_client": self._one_client,
+            "server_metadata": self._hello,
+        }
 
     def close(self) -> None:
         """Close the connection, which ends the episode."""

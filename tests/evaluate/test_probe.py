@@ -12,30 +12,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.lazy import lazy
 from support.messages import raises
-from support.policy_server import PolicyServer, RetraceMemory
+from support.policy_server import Memory, PolicyServer, RetraceMemory
 from support.runs import header, run
 from support.serve_policy import command
 
 from robomme_interference_data.errors import LeakError
 from robomme_interference_data.evaluate.language import subgoal_settings
 from robomme_interference_data.evaluate.language.subgoal_writers import OracleWriter
-from robomme_interference_data.evaluate.run.plan import WorkItem
-from robomme_interference_data.evaluate.run.record import Probe, joined_probe
-from robomme_interference_data.evaluate.run.traces import (
+from robomme_interference_data.evaluate.probe.judgment import ProbeVerdict, first_difference, judge
+from robomme_interference_data.evaluate.probe.noise import LEAK_P, flips, noise_p
+from robomme_interference_data.evaluate.probe.plays import (
     ENOUGH_ROLLOUTS,
-    LEAK_P,
-    Event,
-    Origin,
     PlannedPlay,
-    Play,
-    ProbeVerdict,
-    first_difference,
-    flips,
-    judge,
-    noise_p,
     rounds,
     sequence,
 )
+from robomme_interference_data.evaluate.probe.result import Probe, joined_probe, probe_text
+from robomme_interference_data.evaluate.probe.trace import Component, Event, Play
+from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.ids import EpisodeId
 
 servers = lazy("support.vla_eval_servers")
@@ -54,53 +48,66 @@ def grids(draw: st.DrawFn) -> list[WorkItem]:
     return [WorkItem(name, episode) for episode in episodes for name in names]
 
 
+def still(item: WorkItem) -> bool:
+    """The robot moves in no lesson."""
+    return False
+
+
 @given(grids(), st.integers(1, 3), st.randoms(use_true_random=False))
 def test_a_sequence_is_small_and_repeats_a_rollout_after_another(
     items: list[WorkItem], clients: int, random: Any
 ) -> None:
-    turns = sequence(items, clients=clients)
+    planned = sequence(items, still, clients=clients)
     shuffled = random.sample(items, len(items))
-    assert sequence(shuffled, clients=clients) == turns
-    assert len(turns) <= max(4, 0.05 * len(items))
-    assert {turn.item for turn in turns} <= {*items}
-    assert turns[0] == turns[2]
+    assert sequence(shuffled, still, clients=clients) == planned
+    assert len(planned) <= max(4, 0.05 * len(items))
+    assert {play.item for play in planned} <= {*items}
+    assert planned[0] == planned[2]
     if len({item.condition for item in items}) > 1:
-        assert (turns[0].item.condition, turns[1].item.condition) == ("no-history", "k7")
+        assert (planned[0].item.condition, planned[1].item.condition) == ("no-history", "k7")
     if len({item.episode.family for item in items}) > 1:
-        assert turns[0].item.episode.family != turns[1].item.episode.family
-    assert any(turn.beside is not None for turn in turns) == (clients > 1)
-    assert any(turn.whole for turn in turns) == (len(items) >= ENOUGH_ROLLOUTS)
+        assert planned[0].item.episode.family != planned[1].item.episode.family
+    assert any(play.beside is not None for play in planned) == (clients > 1)
+    assert any(play.whole for play in planned) == (len(items) >= ENOUGH_ROLLOUTS)
+
+
+@given(grids())
+def test_a_rollout_comes_after_one_whose_robot_moves(items: list[WorkItem]) -> None:
+    moving = items[-1].episode
+    planned = sequence(items, lambda item: item.episode == moving, clients=2)
+    assert {play.item for play in planned if play.beside or play.whole} == {planned[1].item}
+    assert planned[1].item.episode == moving
 
 
 @given(grids())
 def test_rounds_have_pairs_after_the_same_rollout(items: list[WorkItem]) -> None:
-    turns = rounds(items)
-    assert len(turns) <= max(16, 0.05 * len(items))
-    pairs = Counter(pairwise(turns))
-    count = len({*turns})
-    assert len(turns) == 4 * count
+    planned = rounds(items)
+    assert len(planned) <= max(16, 0.05 * len(items))
+    pairs = Counter(pairwise(planned))
+    count = len({*planned})
+    assert len(planned) == 4 * count
     assert count < 2 or sum(number >= 2 for number in pairs.values()) >= 2 * count - 2
 
 
 System = Callable[[PlannedPlay, tuple[PlannedPlay, ...], tuple[PlannedPlay, ...]], float]
 
 
-def played(turns: tuple[PlannedPlay, ...], times: int, system: System) -> list[list[Play]]:
+def played(planned: tuple[PlannedPlay, ...], times: int, system: System) -> list[list[Play]]:
     """What a system does that knows a rollout, its client's past, and the whole past."""
     repeats, ever = list[list[Play]](), tuple[PlannedPlay, ...]()
     for _ in range(times):
         plays, past = list[Play](), tuple[PlannedPlay, ...]()
-        for turn in turns:
-            value = system(turn, past, ever)
+        for play in planned:
+            value = system(play, past, ever)
             events = (
-                Event(Origin.SIMULATOR, 0, b"the same"),
-                Event(Origin.POLICY, 0, repr(value).encode()),
+                Event(Component.SIMULATOR, 0, b"the same"),
+                Event(Component.POLICY, 0, repr(value).encode()),
             )
             after = ever[-1].label if ever else None
             labels = tuple(each.label for each in past)
             status = "success" if value > 0 else "fail"
-            plays.append(Play(turn, labels, after, events, (value,), status))
-            past, ever = (*past, turn), (*ever, turn)
+            plays.append(Play(play, labels, after, events, (value,), status))
+            past, ever = (*past, play), (*ever, play)
         repeats.append(plays)
     return repeats
 
@@ -114,13 +121,13 @@ def number(*what: object) -> float:
 def test_a_judgment_tells_what_a_system_remembers(
     items: list[WorkItem], remembers: str, clients: int
 ) -> None:
-    turns = sequence(items, clients=clients)
+    planned = sequence(items, still, clients=clients)
 
-    def system(turn: PlannedPlay, past: Any, ever: Any) -> float:
+    def system(play: PlannedPlay, past: Any, ever: Any) -> float:
         known = {"nothing": (), "client": past, "process": ever[-1:], "all": ever}[remembers]
-        return number(turn.item, known)
+        return number(play.item, known)
 
-    plays = [play for repeat in played(turns, 3, system) for play in repeat]
+    plays = [play for repeat in played(planned, 3, system) for play in repeat]
     verdict, difference = judge(plays)
     expected = {
         "nothing": ProbeVerdict.INDEPENDENT,
@@ -132,11 +139,11 @@ def test_a_judgment_tells_what_a_system_remembers(
     if remembers != "process" or len(items) > 1:
         assert verdict is expected[remembers]
     assert (difference is None) == (verdict is ProbeVerdict.INDEPENDENT)
-    assert difference is None or difference.event.part is Origin.POLICY
+    assert difference is None or difference.event.component is Component.POLICY
 
 
 def test_the_first_difference_ends_with_the_shorter_play() -> None:
-    events = [Event(Origin.POLICY, step, bytes([step])) for step in range(4)]
+    events = [Event(Component.POLICY, step, bytes([step])) for step in range(4)]
     assert first_difference(events, events[:2]) is None
     assert first_difference(events, [*events[:2], events[3]]) == events[3]
 
@@ -144,21 +151,25 @@ def test_the_first_difference_ends_with_the_shorter_play() -> None:
 def test_noise_is_rarely_taken_for_a_leak_and_a_large_leak_is_seen() -> None:
     episodes = [EpisodeId("MoveCube", "test", index) for index in range(8)]
     items = [WorkItem(name, episode) for episode in episodes for name in CONDITIONS]
-    turns, more = sequence(items, clients=2), rounds(items)
+    planned, more = sequence(items, still, clients=2), rounds(items)
     draws = np.random.default_rng(0)
 
-    def noise(turn: PlannedPlay, past: Any, ever: Any) -> float:
+    def noise(play: PlannedPlay, past: Any, ever: Any) -> float:
         return float(draws.normal())
 
-    def leak(turn: PlannedPlay, past: Any, ever: Any) -> float:
+    def leak(play: PlannedPlay, past: Any, ever: Any) -> float:
         return float(bool(past)) + float(draws.normal(0, 0.01))
+
+    def growth(play: PlannedPlay, past: Any, ever: Any) -> float:
+        return len(ever) + float(draws.normal(0, 0.01))
 
     def alarm(system: System) -> bool:
         (plays,) = played(more, 1, system)
-        return noise_p(played(turns, 6, system), plays) < LEAK_P
+        return noise_p(played(planned, 7, system), plays) < LEAK_P
 
     assert sum(alarm(noise) for _ in range(100)) <= 3  # at most one is expected
     assert all(alarm(leak) for _ in range(5))
+    assert all(alarm(growth) for _ in range(5))
 
 
 def test_flips_are_counted_after_the_same_rollout_only() -> None:
@@ -169,10 +180,16 @@ def test_flips_are_counted_after_the_same_rollout_only() -> None:
     assert flips(plays) == (6, 1)
 
 
-def test_the_probe_of_merged_shards_is_the_weakest() -> None:
+def test_the_probe_of_merged_shards_is_the_weakest_and_names_those_without() -> None:
     good, noisy = (Probe(verdict, (), 3, 1) for verdict in ("independent", "nondeterministic"))
-    assert joined_probe([good, noisy]) == noisy
-    assert joined_probe([good, None]) is None
+    assert joined_probe([("one", good), ("two", noisy)]) == noisy
+    assert joined_probe([("one", None)]) is None
+    some = joined_probe([("one", good), ("two", None)])
+    assert some is not None and (some.verdict, some.unprobed) == ("independent", ("two",))
+    assert some.done and good.all_independent and not some.all_independent
+    assert probe_text(some).endswith("after any predecessor; not probed: two")
+    again = joined_probe([("merged", some), ("three", None), ("four", good)])
+    assert again is not None and again.unprobed == ("three", "two")
 
 
 # --- runs ----------------------------------------------------------------------------------------
@@ -204,22 +221,23 @@ def probed(out: Path, policy: str, **changes: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("policy", "changes", "part"),
+    ("policy", "changes", "component"),
     [
         (f"{LEAKY}Leaky", {}, "policy"),
         (f"{LEAKY}NoisyLeaky", {}, "policy"),
         ("noop", {"simulator": "support.leaky:LeakyWorld"}, "simulator"),
+        ("noop", {"simulator": "support.leaky:BrokenWorld"}, "simulator"),
         (f"websocket:{command('--leaks')}", {}, "policy"),
     ],
-    ids=["own", "noisy", "simulator", "websocket"],
+    ids=["own", "noisy", "simulator", "broken", "websocket"],
 )
 def test_a_leak_is_an_error_before_the_run(
-    tmp_path: Path, policy: str, changes: dict[str, Any], part: str
+    tmp_path: Path, policy: str, changes: dict[str, Any], component: str
 ) -> None:
     out = tmp_path / "run"
     with raises(LeakError) as raised:
         probed(out, policy, **changes)
-    assert (raised.value.part, raised.value.step) == (part, 0)
+    assert (raised.value.component, raised.value.step) == (component, 0)
     # Nothing of it is left: another policy may run there.
     assert probed(out, f"{LEAKY}Retrace")["verdict"] == "independent"
 
@@ -240,13 +258,17 @@ def test_a_leaky_writer_of_subgoals_is_an_error(
     monkeypatch.setattr(subgoal_settings, "make_writer", lambda config: Leaky())
     with raises(LeakError) as raised:
         probed(tmp_path / "run", f"{LEAKY}Retrace", subgoals="oracle")
-    assert (raised.value.part, raised.value.step) == ("subgoal writer", 0)
+    assert (raised.value.component, raised.value.step) == ("subgoal writer", 0)
 
 
 def test_noise_is_measured_and_stops_nothing(tmp_path: Path) -> None:
     progress = Notes()
     found = probed(tmp_path / "run", f"{LEAKY}Noisy", progress=progress)
-    assert (found["verdict"], found["part"], found["pairs"]) == ("nondeterministic", "policy", 6)
+    assert (found["verdict"], found["component"], found["pairs"]) == (
+        "nondeterministic",
+        "policy",
+        6,
+    )
     assert 0 <= found["flips"] <= 6 and found["p_value"] >= LEAK_P
     assert f"{found['flips']} of 6 repeated rollouts" in progress.notes[-1]
 
@@ -291,6 +313,47 @@ def test_a_server_at_an_address_is_probed_too(tmp_path: Path, retracing: PolicyS
     found = probed(tmp_path / "run", retracing.url, policy_options=("checkpoint=a",))
     assert found["verdict"] == "independent"
     assert sum(call == {"call": "reset"} for call in retracing.calls) >= 9
+
+
+class Growing(Memory):
+    """Moves a little further with every reset."""
+
+    resets = 0
+
+    def reset(self) -> None:
+        super().reset()
+        self.resets += 1
+
+    def answer(self, message: dict[str, Any]) -> dict[str, Any]:
+        answer = super().answer(message)
+        return answer | {"actions": answer["actions"] + self.resets / 1000}
+
+
+class Drawing(Memory):
+    """Draws from a generator that is seeded when the server is started, and never again."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.generator = np.random.default_rng(0)
+
+    def answer(self, message: dict[str, Any]) -> dict[str, Any]:
+        answer = super().answer(message)
+        return answer | {"actions": answer["actions"] + self.generator.normal(0, 0.01)}
+
+
+def test_a_state_that_grows_in_a_server_is_a_leak_or_shows_when_it_is_started_again(
+    tmp_path: Path,
+) -> None:
+    with PolicyServer(Growing()).running() as server, raises(LeakError) as raised:
+        probed(tmp_path / "run", server.url, policy_options=("checkpoint=a",))
+    assert (raised.value.component, raised.value.step) == ("policy", 0)
+    digests = []
+    for out in ("run", "again"):
+        with PolicyServer(Drawing()).running() as server:
+            found = probed(tmp_path / out, server.url, policy_options=("checkpoint=a",))
+        assert (found["verdict"], found["component"]) == ("nondeterministic", "policy")
+        digests.append(found["digest"])
+    assert digests[0] == digests[1]
 
 
 @pytest.mark.parametrize("shared", [False, True])

@@ -22,6 +22,7 @@ from robomme_interference_data.errors import (
     PolicyServerError,
     RunError,
 )
+from robomme_interference_data.evaluate.policies.identity import lock_servers
 from robomme_interference_data.evaluate.policies.registry import make_policy
 
 servers = lazy("support.vla_eval_servers")
@@ -44,7 +45,7 @@ def test_a_server_that_asks_for_everything() -> None:
     server = servers.Noting(servers.ALL, answer=lambda obs: obs["states"])
     with servers.connected(server) as policy:
         assert policy.cameras == policy.history_cameras == ("front", "wrist")
-        assert policy.wants_history and not policy.every_frame and not policy.one_client
+        assert policy.wants_history and not policy.every_frame
         first, second = servers.play(policy, history=5, live=2)
         np.testing.assert_array_equal(first, np.full((1, 8), 5))
         np.testing.assert_array_equal(second, np.full((1, 8), 6))
@@ -221,15 +222,22 @@ def test_a_fault_of_the_server_is_an_error_row_that_is_repeated(tmp_path: Path) 
 
 
 @pytest.mark.usefixtures("world")
-def test_a_server_with_one_client_has_one_worker(tmp_path: Path) -> None:
+def test_a_server_with_one_client_has_one_worker_and_one_run(tmp_path: Path) -> None:
     settings: dict[str, Any] = {"policy_options": NAMED, "conditions": ("no-history",)}
     for shared in (False, True):
         with servers.running(servers.MmeVlaModelServer(use_history=not shared)) as port:
             settings["policy"] = f"vla-eval:ws://127.0.0.1:{port}"
+            with lock_servers(settings["policy"], tmp_path / "other"):  # of another run
+                if shared:
+                    result = run(tmp_path / "shared", workers=2, **settings)
+                else:
+                    with raises(PolicyServerError):
+                        run(tmp_path / "run", **settings)
             if not shared:
                 with raises(InvalidOptionError):
                     run(tmp_path / "run", workers=2, **settings)
-            assert run(tmp_path / f"{shared}", workers=1 + shared, **settings).counts["fail"] == 2
+                result = run(tmp_path / "run", **settings)
+            assert result.counts["fail"] == 2
 
 
 # --- what does not fit -------------------------------------------------------------------------

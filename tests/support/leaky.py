@@ -86,3 +86,14 @@ class LeakyWorld(World):
         state[0] += self.left
         self.left = np.float32(self.answer[0] / 1000)
         return lesson, Observation(first.images, state), info
+
+
+class BrokenWorld(World):
+    """Begins where the arm was at the end of the episode before, too far off for a rollout."""
+
+    began = False
+
+    def reset(self, episode_id: str, demonstration: bool = True) -> Any:
+        lesson, first, info = super().reset(episode_id, demonstration)
+        began, self.began = self.began, True
+        return lesson, Observation(first.images, first.state + np.float32(began)), info

@@ -10,7 +10,7 @@ from support.runs import untimed
 
 from robomme_interference_data.errors import LeakError, NoRendererError
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
-from robomme_interference_data.evaluate.run.record import Probe
+from robomme_interference_data.evaluate.probe.result import Probe
 from robomme_interference_data.runtime.executor import Serial
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")
@@ -124,7 +124,7 @@ def test_a_policy_that_keeps_its_path_is_an_error_before_the_run(
 
     with pytest.raises(LeakError) as raised:
         probe("Leaky")
-    assert (raised.value.part, raised.value.step) == ("policy", 0)
+    assert (raised.value.component, raised.value.step) == ("policy", 0)
     found = probe("Retrace")
     assert found is not None and found.verdict == "independent"
 

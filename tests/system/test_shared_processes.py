@@ -75,7 +75,7 @@ def test_a_leak_of_a_shared_policy_is_an_error_before_the_run(
 ) -> None:
     with pytest.raises(LeakError) as raised:
         run(tmp_path / "run", policy=f"python:support.leaky:{policy}", no_probe=False)
-    assert raised.value.part == "policy" and words in raised.value.message
+    assert raised.value.component == "policy" and words in raised.value.message
     assert not (tmp_path / "run" / "run.json").exists()
 
 
