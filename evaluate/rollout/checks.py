@@ -89,12 +89,12 @@ def check_policy(config: RunConfig, buffer_set: BufferSet, policy: Policy) -> No
 
 
 def _check_cameras(config: RunConfig, demonstrations: Dataset, policy: Policy) -> None:
-    """Reject cameras that the demonstrations, or the live views, lack."""
+    """Reject cameras that the demonstrations, or the live observations, lack."""
     live = demonstrations if config.offline else simulator_class(config.simulator)
     used = used_cameras(config, policy.cameras, demonstrations)
     for where, lacking in (
         (f"the history of {demonstrations.files.describe()}", {*policy.history_cameras}),
-        ("the live views of the recordings", used if config.offline else set()),
+        ("the live observations of the recordings", used if config.offline else set()),
     ):
         for camera in sorted(lacking - {*demonstrations.cameras}):
             if not demonstrations.cameras:
@@ -334,5 +334,6 @@ def check_lesson(
                 )
         if views and not np.array_equal(query.frame(camera), first.images[camera]):
             raise RunError(
-                f"{query.episode_id}: the first live {camera} view is not the recorded one"
+                f"{query.episode_id}: the first live observation is not the recorded one in "
+                f"{camera}"
             )

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("world")
     [
         ("frame", "frame 7 of the lesson's wrist camera"),
         ("state", "the lesson's states are not"),
-        ("view", "the first live front view is not"),
+        ("view", "observation is not the recorded one in front"),
         ("wrist not rendered", None),
         ("under a shift", None),
     ],
