@@ -33,7 +33,7 @@ from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.episode import ACTION_SIZE, Observation, action_array
 
-from .checks import check_episode, check_lesson
+from .agreement import check_episode, check_lesson
 
 if TYPE_CHECKING:
     from robomme_interference_data.evaluate.language.subgoal_writers import SubgoalWriter

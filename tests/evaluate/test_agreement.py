@@ -12,7 +12,7 @@ from support.worlds import Cheat, World, query_of
 from robomme_interference_data import load_buffer
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import RunError
-from robomme_interference_data.evaluate.rollout.checks import check_lesson
+from robomme_interference_data.evaluate.rollout.agreement import check_lesson
 from robomme_interference_data.simulators.episode import Observation
 
 pytestmark = pytest.mark.usefixtures("world")
