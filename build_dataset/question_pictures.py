@@ -1,4 +1,4 @@
-"""Draw the options of a question on the first live view."""
+"""Draw the options of a question on the first live observation."""
 
 import math
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ Spot = tuple[float, float]
 
 
 def picture(view: NDArray[np.uint8], marks: Sequence[Sequence[Pixel]]) -> NDArray[np.uint8]:
-    """Return an enlarged first live view with options marked and lettered, `(H, W, 3) uint8`.
+    """Return an enlarged first live observation with lettered options, `(H, W, 3) uint8`.
 
     An option of one point has its letter over it, beside those of other options of this point.
     Options of several points are paths: each gets its own drawing. Without points, the picture is

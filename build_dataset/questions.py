@@ -27,7 +27,8 @@ _MOST, _DRAWN = 5, 4
 """Most options of a question; if the scene has more answers, the number that is drawn."""
 
 Marks = Sequence[Sequence[Pixel]]
-"""The points of each option, (y, x) in pixels of the first live view; none if words describe it."""
+"""The points of each option, (y, x) in pixels of the first live observation; none if words describe
+it."""
 
 
 def make_questions(buffer_set: BufferSet) -> Iterator[Question]:

@@ -1,7 +1,7 @@
 """Shortcuts: how far something other than the lesson's frames reveals the hidden answer.
 
-Policies receive the length of the history, the goal and the live view. A policy that guesses from
-one of them needs no memory, and looks like one that remembers. Here each episode's answer is
+Policies receive the length of the history, the goal and the live observation. A policy that guesses
+from one of them needs no memory, and looks like one that remembers. Here each episode's answer is
 guessed from the other episodes of its family (leave-one-out), by a cue alone.
 """
 
@@ -53,7 +53,7 @@ class Shortcut:
         most_frequent: Right guesses if the most frequent value is always guessed: no cue at all.
         length, goal, view: Right guesses by a cue: the value of the episode whose lesson is nearest
             in length, the most frequent value among episodes with the same goal, the value of the
-            episode whose live view looks most alike (encoder `thumbnail`). `view` is None if
+            episode whose live observation looks most alike (encoder `thumbnail`). `view` is None if
             images are not stored.
     """
 

@@ -12,7 +12,7 @@ from .selector import RetrievalStep
 
 
 class StoredSelector(RetrievalStep):
-    """Chooses the frames of a history that match its stored first live view.
+    """Chooses the frames of a history that match its stored first live observation.
 
     No image is embedded: that view has an embedding in the index, too.
     """
@@ -20,12 +20,12 @@ class StoredSelector(RetrievalStep):
     def select(
         self, buffer_set: BufferSet, buffer: Buffer, shift: Shift | None = None
     ) -> NDArray[np.int64]:
-        """Choose the frames of a buffer that match its stored first live view.
+        """Choose the frames of a buffer that match its stored first live observation.
 
         Args:
             buffer_set: The buffer set of the buffer.
             buffer: The history, with at least one frame.
-            shift: Shift of the first live view.
+            shift: Shift of the first live observation.
 
         Returns:
             Indices in the buffer, ascending, `(n,) int64`, n at least 1.

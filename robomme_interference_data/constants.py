@@ -115,12 +115,12 @@ RAW_DISTRACTORS = "distractors-raw"
 CONTRADICTIONS = "contradictions"
 """Lessons in the scenes of the queries with other answers."""
 SHIFTED = "shifted"
-"""First live views of the queries under shifts: a frame for each of `shifts.SHIFTS`."""
+"""First live observations of the queries under shifts: a frame for each of `shifts.SHIFTS`."""
 EXECUTIONS = "executions"
 """Recordings of the queries from the first live observation on, with actions."""
 
 LESSONS = (DEMONSTRATIONS, CONTRADICTIONS)
-"""Datasets of lessons followed by their query frame."""
+"""Datasets of lessons followed by their first live observation."""
 
 
 class Unit(NamedTuple):

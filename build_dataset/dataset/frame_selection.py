@@ -5,7 +5,7 @@ observation. A distractor unit is the first 256 raw frames of an episode subsamp
 32 frames, raw indices 0, 8, …, 248 (paper, section "The history buffer", footnote); a raw unit has
 all of them, 249 at least, so that every unit has a raw one. A builder may choose another number of
 frames, another stride, and several units of an episode. No frame after the last needed one is read.
-An execution is every live frame: its first one is the query frame of the demonstration.
+An execution is every live frame: its first one is the first live observation of the demonstration.
 """
 
 from collections.abc import Iterable, Iterator, Sequence

@@ -62,7 +62,7 @@ def open_source(specification: str, *, shifted: bool = False, **options: Any) ->
     Args:
         specification: `KIND:LOCATION` or `KIND`; see `SOURCES`. Or `MODULE:NAME` of a simulator of
             the user, as in `make_simulator`.
-        shifted: Whether to open the first live views under shifts instead of the episodes.
+        shifted: Whether to open the first live observations under shifts instead of the episodes.
         **options: `columns`, `families_from` and `several_tasks` for `lerobot`, `every`,
             `simulator_python` and `simulator_options` for simulators; other kinds ignore them.
     """

@@ -37,7 +37,7 @@ class SimulatorSource(Source):
     Args:
         name: Registered name of the simulator.
         every: Draw every n-th frame only; all others have no images.
-        shifted: Give the first live view under each shift instead of the episode.
+        shifted: Give the first live observation under each shift instead of the episode.
         simulator_python: Its own interpreter, if it needs one; None for the default.
         simulator_options: Its own arguments, `NAME=VALUE`.
     """

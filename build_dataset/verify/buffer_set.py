@@ -44,9 +44,9 @@ def verify_buffer_set(
 
     Checked are: the SHA-256 of every file, and that none is missing or unlisted; with `decode`,
     every frame and vector of every episode against its recorded hashes; LeRobot's columns;
-    the hashes of embeddings, which are not recomputed; every manifest row and question,
-    which are planned again from the datasets, rules and seed and compared; with `decode`, the first
-    frame of every execution against the query frame, and the questions' pictures, if Pillow is
+    the hashes of embeddings, which are not recomputed; every manifest row and question, which are
+    planned again from the datasets, rules and seed and compared; with `decode`, the first frame of
+    every execution against the first live observation, and the questions' pictures, if Pillow is
     installed.
 
     Args:
@@ -228,7 +228,7 @@ def _table(root: Path, path: str, record: type) -> Iterator[Violation]:
 def _executions(
     executions: Dataset, demonstrations: Dataset, copy: FetchedCopy | None
 ) -> Iterator[Violation]:
-    """Check that executions begin with the query frames of demonstrations, bit for bit."""
+    """Check that executions begin with first live observations of demonstrations, bit for bit."""
     codecs = [CODECS.get(dataset.identity.codec) for dataset in (executions, demonstrations)]
     if not all(codec and codec.exact for codec in codecs):
         return
@@ -239,5 +239,5 @@ def _executions(
         [first] = executions.digests(record.episode_index, [(0, 1)])
         query = queries.get(record.episode_id)
         if query is not None and combine(first) != query.query:
-            what = f"does not begin with the query frame of the {DEMONSTRATIONS}"
+            what = f"does not begin with the first live observation of the {DEMONSTRATIONS}"
             yield Violation(f"{EXECUTIONS} {record.episode_id}", what)

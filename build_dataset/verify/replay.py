@@ -146,7 +146,12 @@ class Replay:
 
 
 def plan_replay(
-    datasets: Mapping[str, Dataset], simulator: str, numbers: Collection[int] | None = None
+    datasets: Mapping[str, Dataset],
+    simulator: str,
+    numbers: Collection[int] | None = None,
+    *,
+    simulator_python: str | None = None,
+    simulator_options: Sequence[str] = (),
 ) -> Replay:
     """Choose the episodes that a simulator plays again: those of datasets that it recorded.
 
@@ -155,6 +160,8 @@ def plan_replay(
         simulator: The simulator, as for `make_simulator`. It is never taken from the data, which
             may name any module.
         numbers: Indices of the episodes; None for all.
+        simulator_python: Its own interpreter, if it needs one; None for the default.
+        simulator_options: Its own arguments, `NAME=VALUE`.
 
     Raises:
         UnknownNameError: There is no such simulator.
@@ -168,7 +175,13 @@ def plan_replay(
         unit = datasets[DISTRACTORS].unit if name in UNITS else PAPER_UNIT
         # As in a build: only the frames that a unit stores are drawn, if the first one is frame 0.
         every = unit.in_dataset(name).stride if name in UNITS and unit.per_episode == 1 else 1
-        source = open_source(simulator, shifted=name == SHIFTED, every=every)
+        source = open_source(
+            simulator,
+            shifted=name == SHIFTED,
+            every=every,
+            simulator_python=simulator_python,
+            simulator_options=simulator_options,
+        )
         stored = [*dataset.identity.sources]
         version = _suite_version(simulator, source.provenance)
         if any(_suite_version(simulator, entry) != version for entry in stored):

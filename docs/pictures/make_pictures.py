@@ -38,7 +38,7 @@ def draw_family(simulator: TabletopSimulator, family: str) -> None:
 
 
 def draw_shifts(simulator: TabletopSimulator) -> None:
-    """Show a first live view as it was recorded, and under each kind: a row, by strength."""
+    """Show a first live observation as it was recorded, and under each kind: a row, by strength."""
     _, first, _ = simulator.reset("InsertPeg/test/2", demonstration=False)
     rows = []
     for kind in KINDS:

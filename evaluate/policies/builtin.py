@@ -32,9 +32,9 @@ class ReplayPolicy(Policy):
     """`replay`: a memory.
 
     It keeps history frames by its memory rule, finds the kept frame that looks most like the first
-    live view, and follows the states after it; at the last state it stops. It knows nothing about
-    sessions, families or answers, so its success shows only whether the right frames are still in
-    memory.
+    live observation, and follows the states after it; at the last state it stops. It knows nothing
+    about sessions, families or answers, so its success shows only whether the right frames are
+    still in memory.
 
     Args:
         memory: A rule, such as `full`, `framesamp:32` or `window:60@2`; see `Memory`.

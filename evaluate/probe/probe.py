@@ -25,7 +25,7 @@ from robomme_interference_data.errors import (
     named,
 )
 from robomme_interference_data.evaluate.policies.registry import server_addresses
-from robomme_interference_data.evaluate.rollout.checks import STATE_TOLERANCE
+from robomme_interference_data.evaluate.rollout.agreement import STATE_TOLERANCE
 from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.plan import WorkItem
 from robomme_interference_data.evaluate.run.worker import WORTH_REPEATING, RunContext

@@ -81,8 +81,10 @@ class Trace:
         try:
             yield
         except Exception as error:
-            known = isinstance(error, InterferenceError)
-            self.error = error.message if known else first_line(error)
+            if isinstance(error, InterferenceError):
+                self.error = error.message
+            else:
+                self.error = first_line(error)
             self._add(component, step, np.frombuffer(self.error.encode(), np.uint8))
             raise
 

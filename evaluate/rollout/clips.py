@@ -1,4 +1,4 @@
-"""Clips of rollouts: the lesson, the received history and the live views, side by side."""
+"""Clips of rollouts: the lesson, the received history and the live observations, side by side."""
 
 import traceback
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -125,7 +125,7 @@ class Clip:
             self._resources.close()
 
     def _show(self, observation: Observation) -> None:
-        """Set the live views, and the lesson's next frame, if it has one."""
+        """Set the live observations, and the lesson's next frame, if it has one."""
         self._live |= observation.images
         self._lesson_frame = next(self._lesson, self._lesson_frame)
 

@@ -33,7 +33,7 @@ from robomme_interference_data.schema.subgoal import Subgoal
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.episode import ACTION_SIZE, Observation, action_array
 
-from .checks import check_episode, check_lesson
+from .agreement import check_episode, check_lesson
 
 if TYPE_CHECKING:
     from robomme_interference_data.evaluate.language.subgoal_writers import SubgoalWriter
@@ -84,7 +84,7 @@ def run_rollout(
     worker = worker or Worker(0)  # no time limit
     reader = history or HistoryReader(buffer_set.datasets)
     # `load` fetches the videos of these cameras. What retrieval selects is unknown before the
-    # first live view, so its frames are fetched when they are decoded.
+    # first live observation, so its frames are fetched when they are decoded.
     cameras = policy.history_cameras if selector is None else ()
     buffer = buffer_set.load(item.episode, item.condition, cameras=cameras)
     received: Sequence[int] = range(len(buffer))
@@ -97,7 +97,7 @@ def run_rollout(
             )
         check_episode(buffer.query, demonstration, first, info)
         if config.check_lesson:
-            # Under a shift the first live view differs from the recorded one.
+            # Under a shift the first live observation differs from the recorded one.
             check_lesson(buffer.query, demonstration, first, views=config.shift == NO_SHIFT)
     trace.observed(0, first)
     if selector is not None and len(buffer):

@@ -42,7 +42,7 @@ from robomme_interference_data.evaluate.run.plan import WorkItem, plan_run
 from robomme_interference_data.evaluate.run.worker import PlannedRun, RunContext, reported_number
 from robomme_interference_data.evaluate.systems import System, SystemFacts, name_system
 from robomme_interference_data.runtime.executor import Executor, WorkerPool
-from robomme_interference_data.schema.renderers import LIVE_VIEWS, renderers_note
+from robomme_interference_data.schema.renderers import LIVE_OBSERVATIONS, renderers_note
 from robomme_interference_data.simulators.base import Simulator
 from robomme_interference_data.simulators.registry import (
     find_simulator_python,
@@ -166,7 +166,7 @@ def _describe_run(
         metadata=metadata,
         identity={
             "simulator_version": dict(versions),
-            "renderers": {**dataset_renderers(buffer_set.datasets), LIVE_VIEWS: live},
+            "renderers": {**dataset_renderers(buffer_set.datasets), LIVE_OBSERVATIONS: live},
             "subgoals": subgoals_identity,
             **other_states,
             **simulator_options,

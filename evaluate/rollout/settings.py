@@ -192,7 +192,7 @@ def used_cameras(
 def live_renderer(
     config: RunConfig, policy_cameras: Iterable[str], demonstrations: Dataset
 ) -> str | None:
-    """Return the renderer of a run's live views; None if it has none, or if it is unknown.
+    """Return the renderer of a run's live observations; None if it has none, or if it is unknown.
 
     Points of the simulator's own subgoals are located in its images.
     """

@@ -43,7 +43,7 @@ from robomme_interference_data.simulators.registry import (
     simulator_versions,
 )
 
-from .checks import check_episode
+from .agreement import check_episode
 from .rollout import run_rollout
 from .settings import simulator_options, used_cameras
 

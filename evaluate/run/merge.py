@@ -13,6 +13,7 @@ from robomme_interference_data.storage.files import LocalFiles
 
 from .log import ERRORS_LOG, check_same_run, open_log, read_run
 from .plan import WorkItem
+from .record import RunHeader
 from .row import Rollout, is_done
 
 
@@ -66,17 +67,8 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
                 merged[item] = row, folder
             elif is_done(row):
                 conflicts[item] = conflicts.get(item, False) or _result(row) != _result(earlier)
-    headers = [header for header, _ in runs]
-    # The merged run is not sharded: it lacks, and can run, what was not given to merge.
-    plans = [replace(plan, shard="1/1") for header in headers for plan in header.plans]
-    joined = replace(
-        first,
-        plans=tuple(plan for place, plan in enumerate(plans) if plan not in plans[:place]),
-        invocations=tuple(start for header in headers for start in header.invocations),
-        merged=tuple(folder.name for folder in folders),
-        probe=joined_probe(
-            [(folder.name, header.probe) for folder, header in zip(folders, headers, strict=True)]
-        ),
+    joined = _joined_header(
+        [(folder.name, header) for folder, (header, _) in zip(folders, runs, strict=True)]
     )
     videos = [(folder, row.video) for row, folder in merged.values() if row.video]
     # `path` refuses links that lead out of the folder.
@@ -99,6 +91,20 @@ def merge_runs(shards: Sequence[str | Path], out: str | Path) -> Merged:
         broken=tuple(item for item in sorted(merged) if not is_done(merged[item][0])),
         duplicates=tuple(sorted(conflicts)),
         conflicts=tuple(sorted(item for item, differs in conflicts.items() if differs)),
+    )
+
+
+def _joined_header(shards: Sequence[tuple[str, RunHeader]]) -> RunHeader:
+    """Return the header of the merged run, given the names and headers of its shards."""
+    headers = [header for _, header in shards]
+    # The merged run is not sharded: it lacks, and can run, what was not given to merge.
+    plans = [replace(plan, shard="1/1") for header in headers for plan in header.plans]
+    return replace(
+        headers[0],
+        plans=tuple(plan for place, plan in enumerate(plans) if plan not in plans[:place]),
+        invocations=tuple(start for header in headers for start in header.invocations),
+        merged=tuple(name for name, _ in shards),
+        probe=joined_probe([(name, header.probe) for name, header in shards]),
     )
 
 

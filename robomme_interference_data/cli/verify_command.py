@@ -28,7 +28,14 @@ if TYPE_CHECKING:
     from robomme_interference_data.evaluate.shortcuts import Shortcut
 
 
-_OF_REPLAY = ("episodes", "workers", "executor", "resources")
+_OF_REPLAY = (
+    "episodes",
+    "simulator_python",
+    "simulator_options",
+    "workers",
+    "executor",
+    "resources",
+)
 """Settings of sources that --replay uses too."""
 
 _FOR_SOURCES = "my-buffers"
@@ -141,7 +148,13 @@ class _PlayedAgain:
         chosen = self.settings.episodes
         numbers = None if chosen is None else {*parse_numbers(chosen)}
         with suppress(FormatError, HashMismatchError, MissingFileError):
-            return plan_replay(opened.datasets, self.simulator, numbers)
+            return plan_replay(
+                opened.datasets,
+                self.simulator,
+                numbers,
+                simulator_python=self.settings.simulator_python,
+                simulator_options=self.settings.simulator_options,
+            )
         return None
 
     def run(self, plan: "Replay", report: dict[str, Any]) -> "list[Violation]":

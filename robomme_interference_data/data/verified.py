@@ -16,7 +16,7 @@ def verify_buffer(
     datasets: Mapping[str, Dataset],
     check_rules: Callable[[BufferManifest], None] | None,
 ) -> None:
-    """Decode a buffer and its first live view, and compare them with what is recorded.
+    """Decode a buffer and its first live observation, and compare them with what is recorded.
 
     Raises:
         HashMismatchError: Records, frames or states differ.

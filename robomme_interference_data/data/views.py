@@ -1,4 +1,4 @@
-"""Stored first live views of queries, with or without a shift of the scene."""
+"""Stored first live observations of queries, with or without a shift of the scene."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from .loading import open_dataset
 def live_frame(
     buffer_set: BufferSet, buffer: Buffer, shift: Shift | None, camera: str | None = None
 ) -> NDArray[np.uint8]:
-    """Decode the stored first live view of a buffer's query, `(H, W, 3) uint8` RGB."""
+    """Decode the stored first live observation of a buffer's query, `(H, W, 3) uint8` RGB."""
     if shift is None:
         return buffer.query.frame(camera)
     views, stored, number = shifted_view(buffer_set, buffer.episode_id, shift)
@@ -32,7 +32,7 @@ def live_embedding(
     encoder: str,
     camera: str | None = None,
 ) -> NDArray[np.float32]:
-    """Read the embedding of the stored first live view of a buffer's query, `(D,) float32`."""
+    """Read the embedding of a buffer's stored first live observation, `(D,) float32`."""
     if shift is None:
         return buffer.query_embedding(encoder, camera)
     views, stored, number = shifted_view(buffer_set, buffer.episode_id, shift)
@@ -44,7 +44,7 @@ def live_embedding(
 def shifted_view(
     buffer_set: BufferSet, episode: EpisodeId, shift: Shift
 ) -> tuple[Dataset, int, int]:
-    """Return the dataset, episode index and frame of a query's first live view under a shift.
+    """Return dataset, episode index and frame of a query's first live observation under a shift.
 
     Raises:
         MissingFileError: The buffer set has no views under shifts.

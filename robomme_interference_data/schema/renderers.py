@@ -1,9 +1,9 @@
-"""Which renderers drew the images that a policy compares: lessons, units and live views."""
+"""Which renderers drew the images that a policy compares: lessons, units and live observations."""
 
 from collections import defaultdict
 from collections.abc import Iterable
 
-LIVE_VIEWS = "live views"
+LIVE_OBSERVATIONS = "live observations"
 """The images of a rollout itself, beside those of datasets."""
 
 
@@ -11,7 +11,7 @@ def renderers_note(renderers: Iterable[tuple[str, str | None]]) -> str | None:
     """Return a sentence about images that different renderers drew; None if none are known to be.
 
     Args:
-        renderers: Names of datasets, or `LIVE_VIEWS`, with a renderer, or None if it is unknown.
+        renderers: Names of datasets, or `LIVE_OBSERVATIONS`, with a renderer; None if unknown.
     """
     drawn = defaultdict[str | None, dict[str, None]](dict)  # without repetitions, in their order
     for images, renderer in renderers:

@@ -132,7 +132,8 @@ def test_executions_begin_with_the_query_frame(tmp_path: Path) -> None:
         other.wrong = {QUERY: {5: replace(shown, **changes)}}
         root = buffer_set(tmp_path / next(iter(changes)), other)
         assert violations(root) == [
-            f"executions {QUERY}: does not begin with the query frame of the demonstrations"
+            f"executions {QUERY}: does not begin with the first live observation of the "
+            "demonstrations"
         ]
     other.wrong = {QUERY: {5: replace(shown, action=shown.action + np.float32(1))}}
     assert violations(buffer_set(tmp_path / "action", other)) == []

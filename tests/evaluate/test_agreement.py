@@ -12,7 +12,7 @@ from support.worlds import Cheat, World, query_of
 from robomme_interference_data import load_buffer
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.errors import RunError
-from robomme_interference_data.evaluate.rollout.checks import check_lesson
+from robomme_interference_data.evaluate.rollout.agreement import check_lesson
 from robomme_interference_data.simulators.episode import Observation
 
 pytestmark = pytest.mark.usefixtures("world")
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("world")
     [
         ("frame", "frame 7 of the lesson's wrist camera"),
         ("state", "the lesson's states are not"),
-        ("view", "the first live front view is not"),
+        ("view", "observation is not the recorded one in front"),
         ("wrist not rendered", None),
         ("under a shift", None),
     ],

@@ -129,13 +129,17 @@ def test_a_run_that_sees_images_resumes_with_the_same_renderer_only(
         out = tmp_path / f"run {warns}"
         run_one(out, policy=STILL, **usual)
         found = header(out)["identity"]["renderers"]
-        assert found == {"demonstrations": drawn, "distractors": drawn, "live views": renderer}
-        differ = f"demonstrations and distractors from {drawn}; live views from a GPU"
+        assert found == {
+            "demonstrations": drawn,
+            "distractors": drawn,
+            "live observations": renderer,
+        }
+        differ = f"demonstrations and distractors from {drawn}; live observations from a GPU"
         assert (differ in caplog.text) is warns
         run_one(tmp_path / f"blind {warns}", policy="noop", **usual)
     with raises(RunError) as raised:
         run_one(tmp_path / "run False", policy=STILL, **usual)
-    assert f"renderers.live views is {drawn!r} there, 'a GPU' here" in raised.value.message
+    assert f"renderers.live observations is {drawn!r} there, 'a GPU' here" in raised.value.message
     run_one(tmp_path / "blind False", policy="noop", **usual)  # its results depend on no image
 
 

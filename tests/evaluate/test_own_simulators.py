@@ -19,11 +19,8 @@ from robomme_interference_data.errors import (
     UnknownNameError,
 )
 from robomme_interference_data.evaluate.policies.registry import make_policy
-from robomme_interference_data.evaluate.rollout.checks import (
-    check_episode,
-    check_policy,
-    check_settings,
-)
+from robomme_interference_data.evaluate.rollout.agreement import check_episode
+from robomme_interference_data.evaluate.rollout.checks import check_policy, check_settings
 from robomme_interference_data.evaluate.rollout.settings import simulator_options
 from robomme_interference_data.simulators import Simulator
 from robomme_interference_data.simulators.episode import Observation

@@ -1,4 +1,4 @@
-"""What lesson length, goal and live view reveal of the answer, by hand."""
+"""What lesson length, goal and live observation reveal of the answer, by hand."""
 
 from collections.abc import Sequence
 from pathlib import Path

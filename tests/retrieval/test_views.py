@@ -1,4 +1,4 @@
-"""Retrieval under shifts: the query frame is the stored first live view of the changed scene."""
+"""Retrieval under shifts: the query is the stored first live observation of the changed scene."""
 
 import json
 import shutil

@@ -38,20 +38,20 @@ def test_two_runs_of_one_system_show_the_noise_floor(tmp_path: Path) -> None:
 
 def test_runs_with_other_renderers_are_noted(tmp_path: Path) -> None:
     def ran(name: str, renderer: object) -> Path:
-        renderers = {"demonstrations": "A", "distractors": None, "live views": renderer}
+        renderers = {"demonstrations": "A", "distractors": None, "live observations": renderer}
         identity = {"simulator": "tabletop", "renderers": renderers}
         return made.write_run(tmp_path / name, own(k0="ssff"), identity)
 
     alike = [ran("a", "A"), ran("same", "A"), ran("blind", None)]
     assert not any("renderers" in note for b in alike[1:] for note in compare(alike[0], b).notes)
     differ = (
-        "Images come from different renderers: demonstrations and live views from A; live views "
-        "from B; distractors unknown."
+        "Images come from different renderers: demonstrations and live observations from A; live "
+        "observations from B; distractors unknown."
     )
     other = ran("b", "B")
     assert any(note.startswith(differ) for note in compare(alike[0], other).notes)
     # A run by itself: its lessons are of A.
-    differ = differ.replace(" and live views from A", " from A")
+    differ = differ.replace(" and live observations from A", " from A")
     (note,) = (note for note in made.score(other).notes if "renderers" in note)
     assert note.startswith(differ)
 

@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
+from support.buffer_sets import build, dataset
 from support.dot_worker import DARK, DIES, RAISES
 from support.messages import raises
 from support.remote_simulators import Dot
@@ -24,6 +25,7 @@ from support.worker_calls import wait_until_gone
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.sources import open_source
+from robomme_interference_data.build_dataset.verify.replay import plan_replay
 from robomme_interference_data.errors import (
     InvalidOptionError,
     MissingExtraError,
@@ -34,6 +36,8 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.evaluate.rollout.runner import plan_rollouts
 from robomme_interference_data.evaluate.run.config import RunConfig
+from robomme_interference_data.progress import WorkProgress
+from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.schema.records import EvidenceSpan
 from robomme_interference_data.simulators import Status
 from robomme_interference_data.simulators.remote import worker as remote_worker
@@ -283,6 +287,19 @@ def test_sources_read_with_its_options_and_record_them(bare_python: Path, run: R
         open_source("tabletop", simulator_python=str(bare_python))
     code, _, err = run("build", "x", "--source", "sample", "--simulator-option", "a=1")
     assert code == 1 and "no effect on sample" in err
+
+
+def test_verify_plays_again_with_its_interpreter_and_options(
+    bare_python: Path, tmp_path: Path
+) -> None:
+    chosen = {"simulator_python": str(bare_python), "simulator_options": ("weight=2.0",)}
+    lessons = {"families": ("LeftSide",), "split": "test", "numbers": (1,)}
+    build(tmp_path, "demonstrations", open_source(DOT, **chosen), **lessons)
+    stored = {"demonstrations": dataset(tmp_path, "demonstrations")}
+    for options, wrong in ((("weight=2.0",), 0), ((), 1)):
+        plan = plan_replay(stored, DOT, **chosen | {"simulator_options": options})
+        found = [*plan.run(Serial(), WorkProgress(quiet=True))]
+        assert sum("observation.state" in violation.what for violation in found) == wrong
 
 
 def test_runs_are_identified_by_its_versions_and_options(

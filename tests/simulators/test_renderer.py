@@ -65,11 +65,12 @@ def test_an_interpreter_that_cannot_draw(tmp_path: Any) -> None:
 
 
 def test_a_note_on_images_from_different_renderers() -> None:
-    lessons, units, live = "demonstrations", "distractors", "live views"
+    lessons, units, live = "demonstrations", "distractors", "live observations"
     assert renderers_note([]) is None
     assert renderers_note([(lessons, None), (units, "A"), (live, "A")]) is None
     assert renderers_note([(lessons, None), (units, None), (live, "A")]) is None
     note = renderers_note([(lessons, None), (units, "A"), (live, "B"), (live, "A"), (live, None)])
     assert note is not None
-    known = "distractors and live views from A; live views from B; demonstrations unknown."
+    known = "distractors and live observations from A; live observations from B; "
+    known += "demonstrations unknown."
     assert known in note

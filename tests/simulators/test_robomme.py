@@ -135,11 +135,11 @@ def test_it_provides_robommes_subgoals(simulator: RoboMMESimulator) -> None:
 @pytest.mark.parametrize(
     ("cameras", "subgoals", "drawn"),
     [
-        # The first picture of each camera, the first live view, one of the two steps.
+        # The first picture of each camera, the first live observation, one of the two steps.
         (["front", "wrist"], False, [3, 3]),
         ([], False, [1, 1]),
         # All of the demonstration, 11 frames that are kept and 11 that are dropped, and both steps;
-        # and once more the first live view.
+        # and once more the first live observation.
         (["front"], True, [25, 1]),
     ],
 )
@@ -166,11 +166,11 @@ def test_only_requested_cameras_are_rendered(
 def test_only_kept_frames_of_a_lesson_are_rendered(robomme_python: Path) -> None:
     with RoboMMESimulator(robomme_python, cameras=["front"], subgoals=False) as simulator:
         for every, shown, drawn in (
-            # The first picture of all, 11 kept frames, once more the live view, and a step.
+            # The first picture of all, 11 kept frames, once more the live observation, and a step.
             (1, [*range(10)], 14),
-            # Of ten frames of the lesson 0, 4 and 8, the live view, and a step.
+            # Of ten frames of the lesson 0, 4 and 8, the live observation, and a step.
             (4, [0, 4, 8], 5),
-            # The first frame; the live view as the eleventh, and once more; and a step.
+            # The first frame; the live observation as the eleventh, and once more; and a step.
             (10, [0], 4),
         ):
             lesson, first, _ = simulator.reset(f"MoveCube/test/{DRAWN}", demonstration=every)

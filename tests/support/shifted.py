@@ -1,4 +1,4 @@
-"""First live views under shifts beside the golden buffer set, made up."""
+"""First live observations under shifts beside the golden buffer set, made up."""
 
 from collections.abc import Generator
 from dataclasses import replace

@@ -52,7 +52,7 @@ LESSON, UNIT = 40, 249
 """Frames of a lesson, and of an episode that yields a unit."""
 
 LIVE, NOBODY = 255, 254
-"""Red of a first live view; green of a frame of no query."""
+"""Red of a first live observation; green of a frame of no query."""
 
 
 def copy_tabletop(folder: Path) -> Path:

@@ -191,7 +191,7 @@ class Cheat:
 def known() -> dict[bytes, NDArray[np.float32]]:
     """Map every frame and joint state of the lessons, as bytes, to the answer.
 
-    The one live view and state that `World` shows of an episode is left out.
+    The one live observation and state that `World` shows of an episode is left out.
     """
     answers: dict[bytes, NDArray[np.float32]] = {}
     shown: set[bytes] = set()

@@ -106,7 +106,7 @@ def test_unknown_cameras_are_errors_that_name_the_option(
         (("retrieval-score", arm, "--calibrate", "--camera", "nope"), "--camera"),
         (("ceiling", arm, *step[:4]), "--set retrieval_camera"),
         (("evaluate", arm, *watcher, *step, "--offline"), "--set retrieval_camera"),
-        (("evaluate", arm, *watcher), "--offline"),  # the live views are the simulator's
+        (("evaluate", arm, *watcher), "--offline"),  # the live observations are the simulator's
     ):
         code, _, err = run(*words)
         assert code == 1 and f" {option}" in err, err

@@ -31,7 +31,7 @@ class LessonLog:
         base.step = step
 
     def moments(self, env: Any) -> list[Any]:
-        """Return a row per recorded frame of the demonstration and for the first live view.
+        """Return a row per recorded frame of the demonstration and for the first live observation.
 
         `(3,) int64` each: steps since the reset, number of the task, 1 if containers hide nothing.
         """
@@ -43,7 +43,7 @@ class LessonLog:
 
 
 def kept_steps(env: Any) -> list[int]:
-    """Return the steps since the reset of each recorded frame and of the first live view."""
+    """Return the steps since the reset of each recorded frame and of the first live observation."""
     return [int(number) for number in _demonstration(env)[4]["elapsed_steps"]]
 
 
