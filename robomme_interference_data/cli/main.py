@@ -27,6 +27,7 @@ from robomme_interference_data.evaluate.score import commands as scoring
 from robomme_interference_data.evaluate.vla_eval import commands as vla_eval
 from robomme_interference_data.retrieval import commands as retrieving
 from robomme_interference_data.storage.hub import check_endpoint
+from robomme_interference_data.training import commands as training
 
 from . import commands, merge_command, show_command, simulate_command, verify_command
 from .console import echo, log_to_stderr, print_status, write_utf8
@@ -127,6 +128,7 @@ _GROUPS: dict[str, tuple[tuple[str, Callable[..., None]], ...]] = {
         ("retrieve", retrieving.retrieve),
         ("retrieval-score", retrieving.retrieval_score),
     ),
+    "Training": (("train", training.train),),
     "Rollouts": (
         ("ceiling", evaluating.ceiling),
         ("evaluate", evaluating.evaluate),
