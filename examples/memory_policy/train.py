@@ -47,6 +47,7 @@ def arguments() -> argparse.Namespace:
     add("--retrieval", "encoder of a retrieval step before the memory, such as thumbnail")
     add("--cameras", "NAME,…; the first if left out", type=names, metavar="NAMES")
     add("--image-size", "side of the images in pixels", type=whole(4, 4), default=64)
+    add("--split", "split of the episodes; test on no episodes of it", default="train")
     add("--families", "NAME,…; all if left out", type=names, default=(), metavar="NAMES")
     add("--episodes", "indices of the episodes to use, such as 0-79; all if left out")
     add("--redraw", "draw the sessions anew in every epoch", action="store_true")
@@ -82,6 +83,7 @@ def main(args: argparse.Namespace) -> None:
         cameras=args.cameras,
         image_size=args.image_size,
         chunk=args.chunk if args.task == "act" else 0,
+        split=args.split,
         families=args.families,
         episodes=args.episodes,
         retrieval=args.retrieval,
@@ -91,8 +93,6 @@ def main(args: argparse.Namespace) -> None:
         seed=args.seed,
     )
     print(data)
-    if tests := [str(one) for one in data.episode_ids if one.split != "train"]:
-        print(f"warning: {tests[0]} and others are not train episodes: do not test on them")
     args.out.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(args.seed)
     item = data[0]

@@ -21,7 +21,7 @@ from robomme_interference_data.evaluate.score.rows.reading import read_rows
 from robomme_interference_data.runtime.executor import Serial
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "memory_policy"
-SMALL = ("--image-size", "16", "--batch", "4", "--device", "cpu")
+SMALL = ("--image-size", "16", "--batch", "4", "--device", "cpu", "--split", "test")
 
 
 @pytest.fixture(autouse=True)
@@ -197,7 +197,7 @@ def test_the_pages_commands_and_its_example(
     (tmp_path / "my-training").symlink_to(executed_buffers)
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
-    exec(code.replace("image_size=96", "image_size=16"), names)  # of 32 pixels
+    exec(code.replace("image_size=96", 'image_size=16, split="test"'), names)  # of 32 pixels
     item = names["item"]
     assert item["memory.images.front"].shape == (31, 3, 16, 16) and item["action"].shape == (16, 8)
 
@@ -251,7 +251,7 @@ def test_questions_with_other_points(places: int, program: Any, tmp_path: Path) 
     program("train", TABLETOP, "--out", run, *options)
     model = sys.modules["memory_model"].load_checkpoint(run)
     data = sys.modules["train"].HistoryDataset(
-        TABLETOP, ["k0"], image_size=16, chunk=0, questions=True, quiet=True
+        TABLETOP, ["k0"], split="test", image_size=16, chunk=0, questions=True, quiet=True
     )
     batch = data[[*range(len(data))]]
     trained = batch["question.points"].shape[2]
@@ -277,7 +277,14 @@ def test_scores_do_not_depend_on_the_rest_of_the_batch(program: Any, tmp_path: P
     model = sys.modules["memory_model"].load_checkpoint(run)
     assert {layer.self_attn.dropout for layer in model.trunk.layers} == {0}
     data = sys.modules["train"].HistoryDataset(
-        TABLETOP, ["k0", "k1"], memory="full", image_size=16, chunk=0, questions=True, quiet=True
+        TABLETOP,
+        ["k0", "k1"],
+        split="test",
+        memory="full",
+        image_size=16,
+        chunk=0,
+        questions=True,
+        quiet=True,
     )
     batch = data[[*range(len(data))]]
     frames, choices = (~batch["memory.is_pad"]).sum(1), (~batch["question.option_is_pad"]).sum(1)
