@@ -7,9 +7,9 @@ below `label.`.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import (
@@ -24,16 +24,11 @@ from . import statistics
 from .draws import number_from
 from .statistics import Statistics
 
-if TYPE_CHECKING:
-    import torch
-
 LAYOUTS = ("plain", "lerobot")
 """The names of entries: those of `HistoryDataset`, or those of this module."""
 
-MEMORY = "observation.memory."
-
 _RENAMED = {
-    "memory.is_pad": MEMORY + "padding",
+    "memory.is_pad": "observation.memory.padding",
     "memory.evidence": "label.evidence",
     "evidence_known": "label.evidence_known",
     "position": "observation.position",
@@ -54,43 +49,72 @@ def renamed(batch: Mapping[str, Any]) -> dict[str, Any]:
     return {_renamed(name): values for name, values in batch.items()}
 
 
+def in_memory(feature: str) -> str:
+    """Return the name of the memory of `observation.state`, or of a camera."""
+    return _renamed(_in_memory(feature))
+
+
 def _renamed(name: str) -> str:
     if name in _RENAMED:
         return _RENAMED[name]
     return f"observation.{name}" if name.startswith(_MOVED) else name
 
 
-def memory_of(feature: str) -> str:
-    """Return the name of the memory of `observation.state`, or of a camera."""
-    return MEMORY + feature.removeprefix("observation.")
-
-
 def transform_images(
-    images: "torch.Tensor",
-    memory: "torch.Tensor",
-    transform: Callable[["torch.Tensor"], "torch.Tensor"],
-    *key: int | str,
+    batch: dict[str, Any],
+    cameras: Sequence[str],
+    transform: Callable[[torch.Tensor], torch.Tensor],
+    keys: Sequence[tuple[int, ...]],
 ) -> None:
-    """Transform the current image of an item and those in its memory in the same random way.
+    """Change the images of a batch at random, all images of an item and a camera in the same way.
 
-    They are transformed in one call, as frames of a video, with fractions from 0 to 1 as values:
-    some of LeRobot's transforms leave bytes unchanged.
+    The current image and those in memory are changed by one call, as frames of a video, with values
+    from 0 to 1: some of LeRobot's transforms leave bytes unchanged.
 
     Args:
-        images: The current image, `(3, S, S) uint8`; is changed.
-        memory: The images in memory, `(M, 3, S, S) uint8`; is changed.
+        batch: A batch with the names of the layout `plain`; is changed.
+        cameras: Features of the cameras.
         transform: From `(M + 1, 3, S, S) float32` to the same.
-        key: What the random numbers follow from.
+        keys: For each item, what its random numbers follow from.
     """
-    import torch
+    for place, key in enumerate(keys):
+        for camera in cameras:
+            now, memory = batch[camera][place], batch[_in_memory(camera)][place]
+            # On CPUs only: other generators belong to the training.
+            with torch.random.fork_rng(devices=[]):
+                torch.manual_seed(number_from("transform", *key, camera))
+                changed = transform(torch.cat([memory, now[None]]).float() / 255)
+            pixels = (changed * 255).round().clamp(0, 255).to(torch.uint8)
+            memory.copy_(pixels[:-1])
+            now.copy_(pixels[-1])
 
-    # On CPUs only: items are made there, and other generators belong to the training.
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(number_from("transform", *key))
-        changed = transform(torch.cat([memory, images[None]]).float() / 255)
-    pixels = (changed * 255).round().clamp(0, 255).to(torch.uint8)
-    memory.copy_(pixels[:-1])
-    images.copy_(pixels[-1])
+
+def _in_memory(feature: str) -> str:
+    return f"memory.{feature.removeprefix('observation.')}"
+
+
+class LeRobotReads:
+    """What LeRobot's training loop asks a dataset for, beside items.
+
+    Attributes:
+        episodes: None: all episodes of `meta` are in use.
+        absolute_to_relative_idx: None: indices of items are those of `meta`.
+        meta: What it is asked beside items.
+    """
+
+    episodes = None
+    absolute_to_relative_idx = None
+    meta: "LeRobotMeta"
+
+    @property
+    def num_frames(self) -> int:
+        """Number of items."""
+        return self.meta.total_frames
+
+    @property
+    def num_episodes(self) -> int:
+        """Number of query episodes."""
+        return self.meta.total_episodes
 
 
 @dataclass(frozen=True)
@@ -145,10 +169,9 @@ def describe(
     buffer_set: BufferSet,
     live: Dataset,
     episodes: Sequence[EpisodeId],
-    stops: NDArray[np.int64],
+    ends: Sequence[int],
     cameras: Sequence[str],
-    values: Callable[[str], NDArray[Any]],
-    images: Callable[[str, int], NDArray[np.uint8]],
+    values: Callable[[str, int | None], NDArray[Any]],
 ) -> LeRobotMeta:
     """Return what LeRobot's training reads of a dataset.
 
@@ -156,16 +179,16 @@ def describe(
         buffer_set: The buffer set.
         live: Its dataset of live frames.
         episodes: The query episodes.
-        stops: The index after the last item of each.
+        ends: The index after the last item of each.
         cameras: Features of the cameras.
-        values: From a feature of vectors to all values in use, `(N, D)`.
-        images: From a feature of a camera to at most so many images in use, `(N, 3, S, S)`.
+        values: From a feature and a number to at most so many stored values, or all: `(N, D)`, of
+            cameras `(N, 3, S, S)`.
     """
     features: dict[str, dict[str, Any]] = {}
     stats: dict[str, Statistics] = {}
     for camera in cameras:
-        frames = images(camera, _SAMPLED_IMAGES)
-        for name in (camera, memory_of(camera)):
+        frames = values(camera, _SAMPLED_IMAGES)
+        for name in (camera, in_memory(camera)):
             features[name] = {
                 "dtype": "video",
                 "shape": (*frames.shape[2:], 3),
@@ -173,8 +196,8 @@ def describe(
             }
             # Of their own: LeRobot writes those of ImageNet over them.
             stats[name] = statistics.of_images(frames)
-    for feature, names in ((STATE, (STATE, memory_of(STATE))), (ACTION, (ACTION,))):
-        vectors = values(feature)
+    for feature, names in ((STATE, (STATE, in_memory(STATE))), (ACTION, (ACTION,))):
+        vectors = values(feature, None)
         if vectors.shape[1]:  # recordings may have no states
             declared = live.lerobot.features.get(feature, {}).get("names")
             for name in names:
@@ -185,7 +208,7 @@ def describe(
                 }
                 stats[name] = statistics.of_vectors(vectors)
     goals = [buffer_set.query(episode).goal for episode in episodes]
-    starts = [0, *stops[:-1].tolist()]
+    starts = [0, *ends[:-1]]
     return LeRobotMeta(
         repo_id=buffer_set.name,
         fps=live.fps,
@@ -196,9 +219,9 @@ def describe(
         episodes={
             "episode_index": list(range(len(episodes))),
             "tasks": [[goal] for goal in goals],
-            "length": np.diff(stops, prepend=0).tolist(),
+            "length": [end - start for start, end in zip(starts, ends, strict=True)],
             "dataset_from_index": starts,
-            "dataset_to_index": stops.tolist(),
+            "dataset_to_index": list(ends),
         },
         tasks=Tasks(tuple(dict.fromkeys(goals))),
     )

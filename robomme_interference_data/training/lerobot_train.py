@@ -24,6 +24,7 @@ from lerobot.utils.constants import IMAGENET_STATS
 from lerobot.utils.import_utils import register_third_party_plugins
 from torch.utils.data import Subset
 
+from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import HashMismatchError, InvalidOptionError, first_line
 from robomme_interference_data.ids import format_numbers, parse_numbers
@@ -54,6 +55,7 @@ class BuffersConfig(DatasetConfig):
     repo_id: str = ""
     content: str = ""
     conditions: dict[str, float] = field(default_factory=dict)
+    split: str = "train"
     families: list[str] = field(default_factory=list)
     cameras: list[str] | None = None
     redraw: bool = False
@@ -149,6 +151,7 @@ def make_datasets(config: BuffersTrainConfig) -> tuple[HistoryDataset, Any]:
             cameras=data.cameras,
             image_size=size,
             chunk=chunk_of_policy(config.policy),
+            split=data.split,
             families=data.families,
             episodes=None if episodes is None else format_numbers(episodes),
             redraw=data.redraw,
@@ -167,7 +170,7 @@ def make_datasets(config: BuffersTrainConfig) -> tuple[HistoryDataset, Any]:
     transforms = ImageTransforms(data.image_transforms) if enabled else None
     if not data.eval_split:
         return make(data.episodes, transforms), None
-    used = data.episodes or sorted({episode.index for episode in buffer_set.episode_ids})
+    used = data.episodes or _indices(buffer_set, data.split)
     held_out = math.ceil(len(used) * data.eval_split)
     if held_out == len(used):
         expected = f"less: of {len(used)} episodes, none is left to train on"
@@ -177,6 +180,11 @@ def make_datasets(config: BuffersTrainConfig) -> tuple[HistoryDataset, Any]:
         # LeRobot takes them from its own table of items.
         evaluation = Subset(evaluation, spread(0, len(evaluation), config.max_eval_samples))
     return make(used[:-held_out], transforms), evaluation
+
+
+def _indices(buffer_set: BufferSet, split: str) -> list[int]:
+    """Return the indices of all query episodes of a split."""
+    return sorted({one.index for one in buffer_set.episode_ids if one.split == split})
 
 
 class _Sampler(EpisodeAwareSampler):
