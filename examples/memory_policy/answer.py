@@ -7,6 +7,7 @@ Memory, cameras and image size are those of the training; conditions and retriev
 
 import argparse
 import csv
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -51,6 +52,12 @@ def main(args: argparse.Namespace) -> None:
     model = load_checkpoint(args.checkpoint, args.device)
     if model.config.task != "answer":
         raise InvalidOptionError(f"{args.checkpoint} was trained to act; expected --task answer.")
+    if model.config.training_step < model.config.training_steps:
+        print(
+            f"warning: {args.checkpoint} is of a training run that is not finished, step "
+            f"{model.config.training_step:,} of {model.config.training_steps:,}",
+            file=sys.stderr,
+        )
     answered = [to_dict(row) for row in rows(model, args)]
     with atomic_path(args.out) as partial, partial.open("w", newline="") as file:
         writer = csv.DictWriter(file, answered[0])
@@ -95,6 +102,7 @@ def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
                     system=args.system,
                     policy="python",
                     policy_id=weights,
+                    training_step=config.training_step,
                     memory=str(memory),
                     retrieval=label,
                     simulator="questions",

@@ -112,6 +112,7 @@ def main(args: argparse.Namespace) -> None:
         trunk=args.trunk,
         pictures=not args.no_pictures,
         seed=args.seed,
+        training_steps=args.steps,
     )
     model = MemoryModel(config)
     if args.task == "act":
@@ -226,7 +227,7 @@ def resume(out: Path, settings: dict[str, Any]) -> dict[str, Any] | None:
 
 def save(out: Path, model: MemoryModel, state: dict[str, Any]) -> None:
     """Write the weights, then what `resume` reads, each whole or not at all, and the log."""
-    save_checkpoint(model, out)
+    save_checkpoint(model, out, state["step"])
     with atomic_path(out / "state.pt") as partial:
         torch.save(state, partial)
     with (out / "log.csv").open("w", newline="") as file:

@@ -16,7 +16,7 @@ from robomme_interference_data.data.dataset import camera_feature
 from robomme_interference_data.data.loading import load_buffer_set, open_cache
 from robomme_interference_data.data.state_reader import other_state_sizes, query_state_size
 from robomme_interference_data.data.views import shifted_view
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.stored_selector import StoredSelector
@@ -29,6 +29,7 @@ from robomme_interference_data.storage.text import digest_json
 
 from .batches import Batches, Drawn
 from .draws import Weights
+from .epoch import Epoch
 from .histories import Histories
 from .items import Items, item_of
 from .lerobot_layout import LAYOUTS, LeRobotMeta, LeRobotReads, describe, renamed, transform_images
@@ -223,8 +224,8 @@ class HistoryDataset(LeRobotReads):
             self.memory_frames,
             self._histories.parts,
         )
-        # Shared with the processes of a loader, which have copies of the dataset.
-        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
+        several = len(self._conditions.names) > 1 or len(self._shifts.names) > 1
+        self._epoch = Epoch(len(self), draws=redraw or several)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced(self, self._arguments)
@@ -249,7 +250,8 @@ class HistoryDataset(LeRobotReads):
         """Number M of places in memory, without the current frame."""
         if self.memory.rule != "full":
             return self.memory.frames - 1
-        return self._histories.longest + self._moments.most - 1
+        longest = self._histories.longest(self._conditions.names, self.episode_ids)
+        return longest + self._moments.most - 1
 
     @cached_property
     def content(self) -> str:
@@ -296,11 +298,37 @@ class HistoryDataset(LeRobotReads):
     @property
     def epoch(self) -> int:
         """The epoch, from 0."""
-        return int(self._epoch)
+        return self._epoch.number
 
     def set_epoch(self, epoch: int) -> None:
-        """Set the epoch, on which all draws depend, in this process and in those of its loaders."""
-        self._epoch.fill_(whole_number("epoch", epoch, "an integer from 0", 0))
+        """Set the epoch, on which all draws depend, in this process and in those of its loaders.
+
+        A `HistorySampler` does so by itself.
+        """
+        self._epoch.set(whole_number("epoch", epoch, "an integer from 0", 0))
+
+    def values(self, name: str) -> NDArray[Any]:
+        """Return a value of each item's moment, such as to weight or leave out moments by it.
+
+        Args:
+            name: `action`, the first of the chunk, `observation.state`, `frame_index` or
+                `episode_id`.
+
+        Returns:
+            `(N, D) float32`, `(N,) int64` or `(N,)` texts.
+
+        Raises:
+            UnknownNameError: There is no such value; actions only if `chunk` is not 0.
+        """
+        numbers, moments = self._moments.of_items
+        known = ["observation.state", "frame_index", "episode_id", *[ACTION] * (self.chunk > 0)]
+        if name not in known:
+            raise UnknownNameError.among("value", name, "the items", known)
+        if name == "frame_index":
+            return moments
+        if name == "episode_id":
+            return np.array([str(episode) for episode in self.episode_ids])[numbers]
+        return self._rows.take(name, self._moments.first[numbers] + moments)
 
     def index_of(self, episode_id: EpisodeId | str, frame_index: int = 0) -> int:
         """Return the index of the item of an episode's moment.
@@ -320,6 +348,7 @@ class HistoryDataset(LeRobotReads):
 
         PyTorch's loaders call it.
         """
+        self._epoch.count(len(indices))
         return Items(self._batch(np.asarray(indices)))
 
     def _batch(self, indices: NDArray[np.integer]) -> dict[str, Any]:

@@ -68,11 +68,6 @@ def check_arguments(given: Mapping[str, Any], shifts: Sequence[str]) -> None:
             raise InvalidOptionError(
                 f"{name} has no effect without {needed}", f"Set {needed}, or leave {name} out."
             )
-    if given["redraw"] and given["memory"] == "full":
-        raise InvalidOptionError(
-            "memory 'full' has no fixed size if sessions are drawn anew",
-            "Set a size, such as memory='window:512', or redraw=False.",
-        )
     if shifts != (NO_SHIFT,) and given["chunk"]:
         expected = "none with actions: only first live observations are stored under shifts"
         raise InvalidOptionError.expected("shifts", list(shifts), expected)
@@ -102,6 +97,13 @@ class Moments:
     def most(self) -> int:
         """Most moments of an episode."""
         return int(np.diff(self.stops, prepend=0).max())
+
+    @property
+    def of_items(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Number of the episode of each item, and its moment, `(N,)` each."""
+        counts = np.diff(self.stops, prepend=0)
+        numbers = np.repeat(np.arange(len(counts)), counts)
+        return numbers, np.arange(len(self)) - (self.stops - counts)[numbers]
 
     def locate(self, index: int) -> tuple[int, int]:
         """Return the number of the episode of an item, and the moment."""
