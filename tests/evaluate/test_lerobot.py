@@ -22,7 +22,7 @@ from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.policies.registry import POLICIES, make_policy
 
 torch, _ = lazy("torch"), lazy("lerobot")
-lerobot = lazy("robomme_interference_data.evaluate.policies.lerobot")
+lerobot = lazy("robomme_interference_data.evaluate.policies.lerobot.policy")
 small = lazy("support.lerobot_policies")
 pytestmark = pytest.mark.filterwarnings("ignore:To evaluate in the environment, your VQ-BeT")
 
@@ -231,7 +231,7 @@ def rename(config: dict[str, Any]) -> None:
             "gives actions {'action': (7,)}; the simulators take action (8,)",
         ),
         (lambda config: config.update(use_peft=True), "is an adapter (PEFT)"),
-        (lambda config: config.update(type="nonesuch"), "Policy type 'nonesuch'"),
+        (lambda config: config.update(type="nonesuch"), "has the type 'nonesuch'"),
         (lambda config: config.update(chunk_size=1), "LeRobot cannot load the policy"),
     ],
 )
