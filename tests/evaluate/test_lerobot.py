@@ -315,6 +315,24 @@ def test_a_model_of_the_hub_is_identified_by_its_commit(
     assert POLICIES.pin(f"lerobot:{act}") == f"lerobot:{act}"
 
 
+def test_a_checkpoint_reports_its_training(act: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(act, tmp_path / "000100" / "pretrained_model")
+    facts = ("training_seed", "training_steps", "training_step")
+
+    def reported() -> dict[str, int]:
+        metadata = made(folder).metadata()
+        return {name: metadata[name] for name in facts if name in metadata}
+
+    assert reported() == {}
+    # As `save_checkpoint` of LeRobot writes them.
+    (folder / "train_config.json").write_text(json.dumps({"steps": 200, "seed": 1000}))
+    assert reported() == {"training_seed": 1000, "training_steps": 200}
+    state = folder.parent / "training_state"
+    state.mkdir()
+    (state / "training_step.json").write_text(json.dumps({"step": 100}))
+    assert reported() == {"training_seed": 1000, "training_steps": 200, "training_step": 100}
+
+
 def test_a_folder_is_identified_by_weights_and_configuration(act: Path, tmp_path: Path) -> None:
     metadata = make_policy(f"lerobot:{act}", ["device=cpu"]).metadata()
     digest = metadata.pop("sha256")

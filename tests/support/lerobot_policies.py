@@ -63,7 +63,8 @@ def stats(cameras: tuple[str, ...]) -> dict[str, dict[str, torch.Tensor]]:
     vector = {"mean": numbers / 8, "std": numbers + 1, "min": -numbers - 1, "max": numbers + 2}
     values = {"mean": 0.4, "std": 0.2, "min": 0.0, "max": 1.0}
     image = {name: torch.full((3, 1, 1), value) for name, value in values.items()}
-    return {STATE: vector, ACTION: vector, **dict.fromkeys(cameras, image)}
+    now = {STATE: vector, **dict.fromkeys(cameras, image)}
+    return now | {in_memory(name): values for name, values in now.items()} | {ACTION: vector}
 
 
 def save_policy(

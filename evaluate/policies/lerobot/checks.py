@@ -98,10 +98,8 @@ def check_features(path: str, config: Any, before: Any, memory: Memory | None) -
 
 def _provided(config: Any, memory: Memory | None) -> dict[str, tuple[int, ...]]:
     """Return the shape of each feature that a policy can have as input."""
-    if memory is None:
-        side = _FULL_SIZE
-    else:
-        side = config.image_size or _FULL_SIZE
+    size = None if memory is None else config.image_size
+    side = size or _FULL_SIZE
     shapes: dict[str, tuple[int, ...]] = {
         FRONT: (3, side, side),
         WRIST: (3, side, side),

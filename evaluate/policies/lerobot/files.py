@@ -1,6 +1,5 @@
 """Find and read the files of a LeRobot policy: configuration, processors, and its training."""
 
-import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
@@ -14,6 +13,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 
 from robomme_interference_data.errors import MissingExtraError, MissingFileError, PolicyError
 from robomme_interference_data.storage.hub import locate
+from robomme_interference_data.storage.text import read_json
 
 POLICY_FILES = ("*.json", "*.safetensors", "*.model")
 """What a policy is loaded from: configuration, weights, tokenizers."""
@@ -47,7 +47,7 @@ def read_config(path: str, folder: Path, device: str) -> Any:
     """
     with explained(path):
         register_third_party_plugins()
-        kind = json.loads((folder / "config.json").read_text(encoding="utf-8")).get("type")
+        kind = read_json(folder / "config.json").get("type")
         if kind is None or kind in PreTrainedConfig.get_known_choices():
             config = PreTrainedConfig.from_pretrained(folder)
             config.device, config.pretrained_path = device, folder
@@ -58,6 +58,25 @@ def read_config(path: str, folder: Path, device: str) -> Any:
         f"Install the package that defines it, by LeRobot's rule: pip install lerobot_policy_{kind}"
         " (or pip install FOLDER, if it is not published).",
     )
+
+
+def read_training(folder: Path) -> dict[str, int]:
+    """Return what `lerobot-train` saved about the training, as far as it is there.
+
+    The seed, the length of the whole training in steps, and, beside a checkpoint of it, the step at
+    which that was saved: `training_seed`, `training_steps`, `training_step`.
+    """
+    saved = (
+        ("training_seed", folder / "train_config.json", "seed"),
+        ("training_steps", folder / "train_config.json", "steps"),
+        ("training_step", folder.parent / TRAINING_STATE_DIR / TRAINING_STEP, "step"),
+    )
+    found = {}
+    for name, path, key in saved:
+        value = read_json(path).get(key) if path.is_file() else None
+        if value is not None:
+            found[name] = int(value)
+    return found
 
 
 def make_processors(config: Any, folder: Path, device: str) -> tuple[Any, Any]:

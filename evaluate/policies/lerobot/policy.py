@@ -21,7 +21,7 @@ from robomme_interference_data.simulators.episode import ACTION_SIZE, Observatio
 from robomme_interference_data.storage.weights import digest_weights
 
 from .checks import check_features, check_statistics, declared_memory, feature_names
-from .files import POLICY_FILES, explained, find_policy, make_processors, read_config
+from .files import POLICY_FILES, explained, find_policy, make_processors, read_config, read_training
 from .observations import LastObservations, Observations, ObservationWithMemory
 
 
@@ -208,13 +208,14 @@ class LeRobotPolicy(BatchPolicy):
             yield
 
     def metadata(self) -> dict[str, Any]:
-        """Return the source, the SHA-256 of its files, and the device."""
+        """Return the source, the SHA-256 of its files, its training, and the device."""
         return {
             "policy": "lerobot",
             "source": self._source,
             "sha256": digest_weights(self._folder, POLICY_FILES),
             "type": self._config.type,
             "n_obs_steps": self._steps,
+            **read_training(self._folder),
             "device": self._device,
         }
 

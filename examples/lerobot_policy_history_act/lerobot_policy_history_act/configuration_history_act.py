@@ -6,8 +6,6 @@ from lerobot.configs import PolicyFeature, PreTrainedConfig
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.utils.constants import OBS_PREFIX, OBS_STATE
 
-from robomme_interference_data.training import Memory
-
 MEMORY_PREFIX = "observation.memory."
 
 
@@ -33,10 +31,6 @@ class HistoryACTConfig(ACTConfig):
     pretrained_backbone_weights: str | None = None
     optimizer_lr: float = 1e-4
     optimizer_lr_backbone: float = 1e-4
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        Memory.parse(self.memory)
 
     @property
     def image_features(self) -> dict[str, PolicyFeature]:

@@ -32,6 +32,7 @@ class HistoryACTPolicy(ACTPolicy):
     def __init__(self, config: HistoryACTConfig, **kwargs: Any):
         super().__init__(config, **kwargs)
         self.model = HistoryACT(config)
+        self._rule = Memory.parse(config.memory)
 
     def reset(self) -> None:
         """Forget what was seen, and the actions that were not executed."""
@@ -55,7 +56,7 @@ class HistoryACTPolicy(ACTPolicy):
     def _own_memory(self, seen: list[dict[str, Tensor]]) -> dict[str, Tensor]:
         """Return the entries of the memory; the last observation is the current one."""
         live = len(seen) - 1
-        kept = [*Memory.parse(self.config.memory).earlier(live)]
+        kept = [*self._rule.earlier(live)]
         size, device = len(seen[live][OBS_STATE]), seen[live][OBS_STATE].device
         memory = {
             in_memory(name): torch.stack([seen[at][name] for at in (*kept, live)], 1)[:, :-1]

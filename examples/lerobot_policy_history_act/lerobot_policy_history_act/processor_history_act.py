@@ -14,7 +14,7 @@ from torch import Tensor
 
 from robomme_interference_data.training import resize
 
-from .configuration_history_act import HistoryACTConfig, in_memory
+from .configuration_history_act import HistoryACTConfig
 
 
 @dataclass
@@ -52,16 +52,14 @@ class ResizeViews(ObservationProcessorStep):
 def make_history_act_pre_post_processors(
     config: HistoryACTConfig, dataset_stats: dict[str, dict[str, Tensor]] | None = None
 ) -> tuple[Any, Any]:
-    """Return pre- and postprocessor.
+    """Return preprocessor and postprocessor.
 
-    A frame in memory is normalized with the statistics of current ones, so that it has the same
-    values as when it was the current one.
+    Statistics of frames in memory must be those of current ones, as `HistoryDataset.meta` has them:
+    then a frame that the policy keeps by itself has the same values as one that it is given.
     """
-    stats = dict(dataset_stats or {})
-    for name in config.remembered:
-        if name in stats:
-            stats[in_memory(name)] = stats[name]
-    steps = make_default_policy_processor_steps(config, stats, normalizer_device=config.device)
+    steps = make_default_policy_processor_steps(
+        config, dataset_stats, normalizer_device=config.device
+    )
     return make_policy_processor_pipelines(
         input_steps=[
             steps.rename_observations,
