@@ -13,8 +13,8 @@ from lerobot.policies.factory import get_policy_class, make_policy_config, make_
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from robomme_interference_data.constants import ACTION, FRONT, STATE, WRIST
-from robomme_interference_data.evaluate.policies.lerobot.observations import in_memory
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
+from robomme_interference_data.schema.memory_features import in_memory
 from robomme_interference_data.simulators.episode import Observation
 
 SIZE = 256

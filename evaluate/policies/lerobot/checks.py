@@ -7,10 +7,14 @@ from lerobot.configs import FeatureType, NormalizationMode
 
 from robomme_interference_data.constants import ACTION, FRONT, STATE, WRIST
 from robomme_interference_data.errors import InterferenceError, PolicyError
+from robomme_interference_data.schema.memory_features import (
+    MEMORY_PADDING,
+    MEMORY_POSITION,
+    POSITION,
+    in_memory,
+)
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.simulators.episode import ACTION_SIZE
-
-from .observations import MEMORY_PADDING, MEMORY_POSITION, POSITION, in_memory
 
 _FULL_SIZE = 256
 """Side of the simulators' images in pixels."""

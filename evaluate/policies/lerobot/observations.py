@@ -9,18 +9,14 @@ import torch
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import CAMERA_PREFIX, STATE
+from robomme_interference_data.schema.memory_features import (
+    MEMORY_PADDING,
+    MEMORY_POSITION,
+    POSITION,
+    in_memory,
+)
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.storage.resize import resize
-
-MEMORY_PREFIX = "observation.memory."
-MEMORY_POSITION = MEMORY_PREFIX + "position"
-MEMORY_PADDING = MEMORY_PREFIX + "padding"
-POSITION = "observation.position"
-
-
-def in_memory(feature: str) -> str:
-    """Return the name of a feature's values in memory: `observation.memory.state`."""
-    return MEMORY_PREFIX + feature.removeprefix("observation.")
 
 
 class Observations(Protocol):

@@ -4,14 +4,9 @@ from dataclasses import dataclass
 
 from lerobot.configs import PolicyFeature, PreTrainedConfig
 from lerobot.policies.act.configuration_act import ACTConfig
-from lerobot.utils.constants import OBS_PREFIX, OBS_STATE
+from lerobot.utils.constants import OBS_STATE
 
-MEMORY_PREFIX = "observation.memory."
-
-
-def in_memory(name: str) -> str:
-    """Return the name of a feature's values in memory: `observation.memory.state`."""
-    return MEMORY_PREFIX + name.removeprefix(OBS_PREFIX)
+from robomme_interference_data.schema.memory_features import MEMORY_PREFIX, in_memory
 
 
 @PreTrainedConfig.register_subclass("history_act")

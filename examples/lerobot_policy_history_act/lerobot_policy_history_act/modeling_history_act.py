@@ -7,13 +7,15 @@ from lerobot.policies.act.modeling_act import ACT, ACTEncoder, ACTPolicy
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor, nn
 
+from robomme_interference_data.schema.memory_features import (
+    MEMORY_PADDING,
+    MEMORY_POSITION,
+    POSITION,
+    in_memory,
+)
 from robomme_interference_data.training import Memory
 
-from .configuration_history_act import MEMORY_PREFIX, HistoryACTConfig, in_memory
-
-_POSITION = MEMORY_PREFIX + "position"
-_PADDING = MEMORY_PREFIX + "padding"
-_NOW = "observation.position"
+from .configuration_history_act import HistoryACTConfig
 
 
 class HistoryACTPolicy(ACTPolicy):
@@ -42,14 +44,14 @@ class HistoryACTPolicy(ACTPolicy):
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return the next action, `(B, A)`."""
-        if _POSITION not in batch:
+        if MEMORY_POSITION not in batch:
             self._seen.append({name: batch[name] for name in self.config.remembered})
         return super().select_action(batch, **kwargs)
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return the next actions, `(B, chunk_size, A)`."""
-        if _POSITION not in batch:
+        if MEMORY_POSITION not in batch:
             batch = batch | self._own_memory(self._seen or [batch])
         return super().predict_action_chunk(batch, **kwargs)
 
@@ -63,9 +65,9 @@ class HistoryACTPolicy(ACTPolicy):
             for name in self.config.remembered
         }
         return memory | {
-            _POSITION: torch.tensor(kept, dtype=torch.int64, device=device).expand(size, -1),
-            _PADDING: torch.zeros(size, len(kept), dtype=torch.bool, device=device),
-            _NOW: torch.full((size,), live, device=device),
+            MEMORY_POSITION: torch.tensor(kept, dtype=torch.int64, device=device).expand(size, -1),
+            MEMORY_PADDING: torch.zeros(size, len(kept), dtype=torch.bool, device=device),
+            POSITION: torch.full((size,), live, device=device),
         }
 
 
@@ -103,9 +105,9 @@ class MemoryTokens(nn.Module):
         for name, encoder in zip(self.names, self.views, strict=True):
             images = batch[name]
             tokens = tokens + encoder(images.flatten(0, 1)).unflatten(0, images.shape[:2])
-        age = batch[_NOW][:, None] - batch[_POSITION]
+        age = batch[POSITION][:, None] - batch[MEMORY_POSITION]
         time = embed_time(age, tokens.shape[-1])
-        return tokens.transpose(0, 1), time.transpose(0, 1), batch[_PADDING]
+        return tokens.transpose(0, 1), time.transpose(0, 1), batch[MEMORY_PADDING]
 
 
 class EncoderWithMemory(ACTEncoder):
