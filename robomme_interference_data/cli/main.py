@@ -123,12 +123,12 @@ _GROUPS: dict[str, tuple[tuple[str, Callable[..., None]], ...]] = {
         ("show", show_command.show),
         ("simulate", simulate_command.simulate),
     ),
+    "Training": (("train", training.train),),
     "Retrieval": (
         ("index", retrieving.index),
         ("retrieve", retrieving.retrieve),
         ("retrieval-score", retrieving.retrieval_score),
     ),
-    "Training": (("train", training.train),),
     "Rollouts": (
         ("ceiling", evaluating.ceiling),
         ("evaluate", evaluating.evaluate),

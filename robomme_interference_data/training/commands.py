@@ -29,9 +29,7 @@ def train(
     ] = None,
     cameras: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Cameras; default: the first.", callback=split_commas, metavar="NAME,…"
-        ),
+        typer.Option(help="Cameras; default: the first.", callback=split_commas, metavar="NAME,…"),
     ] = None,
     redraw: Annotated[
         bool, typer.Option(help="Draw the sessions of the conditions anew in every epoch.")

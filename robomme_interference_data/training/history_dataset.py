@@ -32,7 +32,7 @@ from .draws import Weights
 from .epoch import Epoch
 from .histories import Histories
 from .items import Items, item_of
-from .lerobot_layout import LAYOUTS, LeRobotMeta, LeRobotReads, describe, renamed, transform_images
+from .lerobot_layout import LeRobotMeta, LeRobotReads, describe, renamed, transform_images
 from .moments import check_arguments, check_size, choose_moments, drawable_rows, needed_datasets
 from .question_tensors import QuestionTensors
 from .reopening import reduced
@@ -158,8 +158,6 @@ class HistoryDataset(LeRobotReads):
             other_states=other_states, seed=seed, cache=cache, layout=layout,
             image_transforms=image_transforms,
         )  # fmt: skip
-        if layout not in LAYOUTS:
-            raise InvalidOptionError.one_of("layout", layout, LAYOUTS)
         self.layout, self._image_transforms = layout, image_transforms
         self.memory, self.seed = Memory.parse(memory), seed
         self.chunk = whole_number("chunk", chunk, "an integer from 0", 0)

@@ -9,20 +9,21 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import (
-    ACTION,
-    STATE,
-)
+from robomme_interference_data.constants import ACTION, STATE
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.storage.lerobot.statistics import (
+    ImageStats,
+    Statistics,
+    vector_statistics,
+)
 
-from . import statistics
 from .draws import number_from
-from .statistics import Statistics
 
 LAYOUTS = ("plain", "lerobot")
 """The names of entries: those of `HistoryDataset`, or those of this module."""
@@ -147,7 +148,7 @@ class LeRobotMeta:
     fps: float
     robot_type: str | None
     features: dict[str, dict[str, Any]]
-    stats: dict[str, Statistics]
+    stats: Statistics
     camera_keys: list[str]
     episodes: dict[str, list[Any]]
     tasks: Tasks
@@ -185,7 +186,7 @@ def describe(
             cameras `(N, 3, S, S)`.
     """
     features: dict[str, dict[str, Any]] = {}
-    stats: dict[str, Statistics] = {}
+    stats: Statistics = {}
     for camera in cameras:
         frames = values(camera, _SAMPLED_IMAGES)
         for name in (camera, in_memory(camera)):
@@ -195,18 +196,14 @@ def describe(
                 "names": ["height", "width", "channels"],
             }
             # Of their own: LeRobot writes those of ImageNet over them.
-            stats[name] = statistics.of_images(frames)
+            stats[name] = _image_statistics(frames)
     for feature, names in ((STATE, (STATE, in_memory(STATE))), (ACTION, (ACTION,))):
         vectors = values(feature, None)
         if vectors.shape[1]:  # recordings may have no states
             declared = live.lerobot.features.get(feature, {}).get("names")
             for name in names:
-                features[name] = {
-                    "dtype": "float32",
-                    "shape": vectors.shape[1:],
-                    "names": declared,
-                }
-                stats[name] = statistics.of_vectors(vectors)
+                features[name] = {"dtype": "float32", "shape": vectors.shape[1:], "names": declared}
+                stats[name] = vector_statistics(vectors)
     goals = [buffer_set.query(episode).goal for episode in episodes]
     starts = [0, *ends[:-1]]
     return LeRobotMeta(
@@ -226,3 +223,13 @@ def describe(
         tasks=Tasks(tuple(dict.fromkeys(goals))),
     )
 
+
+def _image_statistics(frames: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
+    """Return the statistics of images `(N, 3, H, W)`, `(3, 1, 1)` on the scale 0 to 1."""
+    counts = ImageStats()
+    for frame in frames:
+        counts.add(frame.transpose(1, 2, 0))
+    return {
+        name: values if name == "count" else (values / 255).reshape(3, 1, 1)
+        for name, values in counts.result().items()
+    }

@@ -35,7 +35,7 @@ from .history_dataset import HistoryDataset
 
 
 @dataclass
-class BuffersConfig(DatasetConfig):
+class TrainingData(DatasetConfig):
     """The data of a training, which LeRobot saves in each checkpoint's `train_config.json`.
 
     Of LeRobot's own settings, `repo_id`, `root`, `revision`, `episodes`, `image_transforms`,
@@ -64,10 +64,10 @@ class BuffersConfig(DatasetConfig):
 
 
 @dataclass
-class BuffersTrainConfig(TrainPipelineConfig):
+class TrainingConfig(TrainPipelineConfig):
     """LeRobot's settings of a training, with a buffer set as dataset."""
 
-    dataset: BuffersConfig
+    dataset: TrainingData
 
     def validate(self) -> None:
         """Check the settings.
@@ -123,7 +123,7 @@ def chunk_of_policy(config: Any) -> int:
     return len(actions)
 
 
-def make_datasets(config: BuffersTrainConfig) -> tuple[HistoryDataset, Any]:
+def make_datasets(config: TrainingConfig) -> tuple[HistoryDataset, Any]:
     """Return the data to train on, and those to evaluate on or None; what LeRobot calls.
 
     With `eval_split`, the last query episodes of all families are held out.
@@ -197,14 +197,12 @@ class _Sampler(EpisodeAwareSampler):
         return super().__iter__()
 
 
-def arguments(
-    buffer_set: str, given: Mapping[str, Any], others: Sequence[str]
-) -> list[str]:
+def arguments(buffer_set: str, given: Mapping[str, Any], others: Sequence[str]) -> list[str]:
     """Return the options of `lerobot-train` for a buffer set.
 
     Args:
         buffer_set: Folder of the buffer set, or `namespace/name` on the Hub.
-        given: Settings of `BuffersConfig`; those that are None are left out, so that those of a
+        given: Settings of `TrainingData`; those that are None are left out, so that those of a
             resumed training stay. Episodes are given as text, such as `0-79`.
         others: Further options.
     """
@@ -237,13 +235,13 @@ def train(arguments: Sequence[str]) -> None:
         HashMismatchError: The training is resumed, but the buffer set has changed.
     """
 
-    def datasets(config: BuffersTrainConfig) -> tuple[HistoryDataset, Any]:
+    def datasets(config: TrainingConfig) -> tuple[HistoryDataset, Any]:
         made = make_datasets(config)
         lerobot_train.EpisodeAwareSampler = type("Sampler", (_Sampler,), {"data": made[0]})
         return made
 
     @parser.wrap()
-    def run(config: BuffersTrainConfig) -> None:
+    def run(config: TrainingConfig) -> None:
         # Without the parser of LeRobot's own settings around it.
         lerobot_train.train.__wrapped__(config)
 
@@ -255,8 +253,6 @@ def train(arguments: Sequence[str]) -> None:
         register_third_party_plugins()
         run()
     finally:
-        (
-            lerobot_train.make_train_eval_datasets,
-            lerobot_train.EpisodeAwareSampler,
-            sys.argv,
-        ) = replaced
+        (lerobot_train.make_train_eval_datasets, lerobot_train.EpisodeAwareSampler, sys.argv) = (
+            replaced
+        )

@@ -22,6 +22,7 @@ from robomme_interference_data.ids import EpisodeId, format_numbers, parse_numbe
 from robomme_interference_data.schema.conditions import datasets_of, parse_condition
 from robomme_interference_data.schema.shifts import NO_SHIFT
 
+from .lerobot_layout import LAYOUTS
 from .rows import StoredRows
 
 _NO_ACTIONS = "Items without actions (chunk=0) need no executions."
@@ -58,7 +59,9 @@ def check_size(buffer_set: BufferSet, cameras: Sequence[str], size: int | None) 
 
 
 def check_arguments(given: Mapping[str, Any], shifts: Sequence[str]) -> None:
-    """Check the arguments of a `HistoryDataset` against each other."""
+    """Check arguments of a `HistoryDataset`, and some against each other."""
+    if given["layout"] not in LAYOUTS:
+        raise InvalidOptionError.one_of("layout", given["layout"], LAYOUTS)
     for name, default, needed in (
         ("unit_episodes", None, "redraw"),
         ("retrieval_rule", "max", "retrieval"),

@@ -48,7 +48,9 @@ def train(executed_buffers: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     _ = small.TinyMemoryConfig  # the import registers it
     monkeypatch.setenv(small.LOG, str(tmp_path / "log"))
 
-    def call(*others: str, out: str = "run", buffers: Path = executed_buffers, **given: Any) -> Path:
+    def call(
+        *others: str, out: str = "run", buffers: Path = executed_buffers, **given: Any
+    ) -> Path:
         settings = {"conditions": {"k0": 1, "k7": 2}, "split": "test"} | given
         options = [*others, f"--output_dir={tmp_path / out}"]
         training.train(training.arguments(str(buffers), settings, options))
