@@ -22,7 +22,9 @@ def train(
             metavar="NAME,…",
         ),
     ] = None,
-    split: Annotated[str | None, typer.Option(help="Split of the episodes.")] = None,
+    split: Annotated[
+        str | None, typer.Option(help="Split of the episodes; default: train.")
+    ] = None,
     families: Families = [],  # noqa: B006 - typer copies it
     episodes: Annotated[
         str | None, typer.Option(help="Indices of query episodes, such as 0-79; default: all.")
