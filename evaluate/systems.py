@@ -31,6 +31,9 @@ class SystemFacts:
         "What identifies the policy among those of its kind: a digest of its options, metadata and "
         "files, without where it runs. Of published rows a name. None if unknown.",
     ] = None
+    training_step: Annotated[
+        int | None, "Step of the training run that the weights are of, or None if unknown."
+    ] = None
     memory: Annotated[
         str | None,
         "Rule by which the memory keeps frames, such as `full`, `framesamp:32` or `window:60@2`; "

@@ -18,7 +18,13 @@ from robomme_interference_data.evaluate.run.identity import retrieval_text, shor
 from robomme_interference_data.evaluate.run.log import unfinished
 from robomme_interference_data.evaluate.run.plan import WorkItem, plan_run
 from robomme_interference_data.evaluate.run.row import Rollout, model_columns
-from robomme_interference_data.evaluate.run.worker import Job, PlannedRun, RunContext, RunFunction
+from robomme_interference_data.evaluate.run.worker import (
+    Job,
+    PlannedRun,
+    RunContext,
+    RunFunction,
+    reported_number,
+)
 from robomme_interference_data.evaluate.systems import SYSTEMS, SystemFacts, name_system
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Executor, Worker, WorkerPool
@@ -89,6 +95,7 @@ def _describe_run(
     facts = SystemFacts(
         policy=MODELS.parse(config.model).kind if responder is None else config.model,
         policy_id=short_digest({"model": model, "control": config.control}),
+        training_step=reported_number(metadata, "training_step"),
         # A guess sees no frame: a memory would pair it with systems that have one.
         memory=config.memory if responder is None or responder.reads_history else None,
         retrieval=retrieval_text(config, buffer_set),

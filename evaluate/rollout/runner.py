@@ -38,7 +38,7 @@ from robomme_interference_data.evaluate.run.config import RunConfig
 from robomme_interference_data.evaluate.run.identity import retrieval_text, short_digest
 from robomme_interference_data.evaluate.run.log import unfinished
 from robomme_interference_data.evaluate.run.plan import WorkItem, plan_run
-from robomme_interference_data.evaluate.run.worker import PlannedRun, RunContext
+from robomme_interference_data.evaluate.run.worker import PlannedRun, RunContext, reported_number
 from robomme_interference_data.evaluate.systems import System, SystemFacts, name_system
 from robomme_interference_data.runtime.executor import Executor, WorkerPool
 from robomme_interference_data.schema.renderers import LIVE_VIEWS, renderers_note
@@ -135,6 +135,7 @@ def _describe_run(
     facts = SystemFacts(
         policy=POLICIES.parse(config.policy).kind,
         policy_id=short_digest(identity),
+        training_step=reported_number(policy_metadata, "training_step"),
         memory=declared_memory(policy, policy_metadata) or published.memory,
         retrieval=retrieval_text(config, buffer_set),
         subgoals=subgoals,
@@ -200,7 +201,10 @@ def _start_server(run: RunContext[RunConfig], pool: WorkerPool) -> RunContext[Ru
         check_memory_kind(keeps, reported["server"], system)
     identity = policy_identity(config.policy, config.policy_options, reported)
     facts = dataclasses.replace(
-        run.facts, policy_id=short_digest(identity), memory=memory or run.facts.memory
+        run.facts,
+        policy_id=short_digest(identity),
+        training_step=reported_number(reported, "training_step"),
+        memory=memory or run.facts.memory,
     )
     # Until now the policy's metadata were empty; those of a writer of subgoals are kept.
     return dataclasses.replace(

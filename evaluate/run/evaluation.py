@@ -13,6 +13,7 @@ A run has these steps, each of which takes values and returns values:
 """
 
 import dataclasses
+import logging
 from collections.abc import Generator, Iterable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
@@ -52,6 +53,8 @@ from .worker import Job, PlannedRun, RunContext
 
 if TYPE_CHECKING:
     import pandas
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -147,6 +150,8 @@ def run_evaluation(
         ExitStack() as stack,
     ):
         run, plan = planned.run, planned.plan
+        if run.unfinished_training is not None:
+            logger.warning("%s", run.unfinished_training)
         identity = run_identity(run, plan, buffer_set)
         log = stack.enter_context(
             open_log(folder, identity, buffer_set.name, resume=not config.no_resume)

@@ -28,6 +28,16 @@ if TYPE_CHECKING:
     from robomme_interference_data.retrieval.selector import Selector
 
 
+def reported_number(metadata: Mapping[str, Any], name: str) -> int | None:
+    """Return a whole number that a policy or its server reports of itself; None if none does."""
+    for reported in (metadata, metadata.get("server_metadata")):
+        number = reported.get(name) if isinstance(reported, Mapping) else None
+        # A bool is an int in Python, and no number.
+        if isinstance(number, int) and not isinstance(number, bool) and number >= 0:
+            return number
+    return None
+
+
 @dataclass(frozen=True)
 class RunContext[C: RunConfig | AskConfig]:
     """What is known of a run before its first row.
@@ -61,12 +71,18 @@ class RunContext[C: RunConfig | AskConfig]:
         """
         if self.config.training_seed is not None:
             return self.config.training_seed
-        for reported in (self.metadata, self.metadata.get("server_metadata")):
-            seed = reported.get("training_seed") if isinstance(reported, Mapping) else None
-            # A bool is an int in Python, and no seed.
-            if isinstance(seed, int) and not isinstance(seed, bool) and seed >= 0:
-                return seed
-        return None
+        return reported_number(self.metadata, "training_seed")
+
+    @property
+    def unfinished_training(self) -> str | None:
+        """That the weights are of an unfinished training run, in a sentence; None if not known.
+
+        A policy reports the length of the run as `training_steps`, beside `training_step`.
+        """
+        step, steps = self.facts.training_step, reported_number(self.metadata, "training_steps")
+        if step is None or steps is None or step >= steps:
+            return None
+        return f"{self.system}: the training run is not finished, step {step:,} of {steps:,}"
 
     def key(self, item: WorkItem) -> dict[str, Any]:
         """Return what identifies the row of a work item: its `KEY_COLUMNS`."""

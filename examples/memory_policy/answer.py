@@ -7,13 +7,14 @@ Memory, cameras and image size are those of the training; conditions and retriev
 
 import argparse
 import csv
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import torch
 from command_line import default_device, device, names, run
 from memory_model import MemoryModel, load_checkpoint, on_device
-from torch.utils.data import BatchSampler, DataLoader
+from torch.utils.data import DataLoader
 
 from robomme_interference_data import EpisodeId, Rollout, load_buffer_set
 from robomme_interference_data.constants import DEMONSTRATIONS, PROTOCOL_VERSION
@@ -38,6 +39,7 @@ def arguments() -> argparse.Namespace:
     add("--out", type=Path, required=True, help="CSV file to write")
     add("--system", required=True, help="label of the rows, such as learned-k0")
     add("--conditions", type=names, metavar="NAMES", help="NAME,…; all that apply if left out")
+    add("--split", default="test", help="split of the episodes (%(default)s)")
     add("--retrieval", help="encoder of a retrieval step before the memory, such as thumbnail")
     add("--device", type=device, default=default_device(), help="cpu or cuda (%(default)s)")
     return parser.parse_args()
@@ -50,6 +52,12 @@ def main(args: argparse.Namespace) -> None:
     model = load_checkpoint(args.checkpoint, args.device)
     if model.config.task != "answer":
         raise InvalidOptionError(f"{args.checkpoint} was trained to act; expected --task answer.")
+    if model.config.training_step < model.config.training_steps:
+        print(
+            f"warning: {args.checkpoint} is of a training run that is not finished, step "
+            f"{model.config.training_step:,} of {model.config.training_steps:,}",
+            file=sys.stderr,
+        )
     answered = [to_dict(row) for row in rows(model, args)]
     with atomic_path(args.out) as partial, partial.open("w", newline="") as file:
         writer = csv.DictWriter(file, answered[0])
@@ -73,13 +81,13 @@ def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
             cameras=config.cameras,
             image_size=config.image_size,
             chunk=0,
+            split=args.split,
             questions=True,
             retrieval=args.retrieval,
             quiet=True,
         )
         right = 0
-        batches = BatchSampler(range(len(data)), 16, drop_last=False)
-        for batch in DataLoader(data, batch_size=None, sampler=batches):
+        for batch in DataLoader(data, batch_size=16):
             with torch.inference_mode():
                 chosen = model(on_device(batch, args.device)).argmax(1).tolist()
             for number, option in enumerate(chosen):
@@ -94,6 +102,7 @@ def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
                     system=args.system,
                     policy="python",
                     policy_id=weights,
+                    training_step=config.training_step,
                     memory=str(memory),
                     retrieval=label,
                     simulator="questions",

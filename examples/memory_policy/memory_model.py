@@ -6,7 +6,7 @@ the tokens and ends in a score for each option, or in a chunk of actions.
 """
 
 import zlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,8 @@ class Config:
     attention_dropout: bool = True  # False: attention over a long memory is several times as fast
     pictures: bool = True  # False: the control, with its memory's positions and lengths only
     seed: int = 0
+    training_step: int = 0
+    training_steps: int = 0
 
     @property
     def targets_are_states(self) -> bool:
@@ -248,9 +250,9 @@ def on_device(batch: dict[str, Any], device: str) -> dict[str, Any]:
     }
 
 
-def save_checkpoint(model: MemoryModel, folder: Path) -> None:
+def save_checkpoint(model: MemoryModel, folder: Path, step: int) -> None:
     """Write `config.json` and `model.safetensors`, each whole or not at all."""
-    write_json(folder / "config.json", asdict(model.config))
+    write_json(folder / "config.json", asdict(replace(model.config, training_step=step)))
     with atomic_path(folder / "model.safetensors") as partial:
         partial.write_bytes(save(model.state_dict()))
 

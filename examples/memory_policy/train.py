@@ -47,6 +47,7 @@ def arguments() -> argparse.Namespace:
     add("--retrieval", "encoder of a retrieval step before the memory, such as thumbnail")
     add("--cameras", "NAME,…; the first if left out", type=names, metavar="NAMES")
     add("--image-size", "side of the images in pixels", type=whole(4, 4), default=64)
+    add("--split", "split of the episodes; test on no episodes of it", default="train")
     add("--families", "NAME,…; all if left out", type=names, default=(), metavar="NAMES")
     add("--episodes", "indices of the episodes to use, such as 0-79; all if left out")
     add("--redraw", "draw the sessions anew in every epoch", action="store_true")
@@ -82,6 +83,7 @@ def main(args: argparse.Namespace) -> None:
         cameras=args.cameras,
         image_size=args.image_size,
         chunk=args.chunk if args.task == "act" else 0,
+        split=args.split,
         families=args.families,
         episodes=args.episodes,
         retrieval=args.retrieval,
@@ -91,8 +93,6 @@ def main(args: argparse.Namespace) -> None:
         seed=args.seed,
     )
     print(data)
-    if tests := [str(one) for one in data.episode_ids if one.split != "train"]:
-        print(f"warning: {tests[0]} and others are not train episodes: do not test on them")
     args.out.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(args.seed)
     item = data[0]
@@ -112,6 +112,7 @@ def main(args: argparse.Namespace) -> None:
         trunk=args.trunk,
         pictures=not args.no_pictures,
         seed=args.seed,
+        training_steps=args.steps,
     )
     model = MemoryModel(config)
     if args.task == "act":
@@ -226,7 +227,7 @@ def resume(out: Path, settings: dict[str, Any]) -> dict[str, Any] | None:
 
 def save(out: Path, model: MemoryModel, state: dict[str, Any]) -> None:
     """Write the weights, then what `resume` reads, each whole or not at all, and the log."""
-    save_checkpoint(model, out)
+    save_checkpoint(model, out, state["step"])
     with atomic_path(out / "state.pt") as partial:
         torch.save(state, partial)
     with (out / "log.csv").open("w", newline="") as file:

@@ -76,7 +76,9 @@ class Histories:
 
     @property
     def rows(self) -> NDArray[np.int64]:
-        """The rows of all planned histories."""
+        """The rows of all planned histories; none if they are drawn anew."""
+        if self._redraw is not None:
+            return np.empty(0, np.int64)
         return np.concatenate([history.rows for history in self._known.values()])
 
     def plan(

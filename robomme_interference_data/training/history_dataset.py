@@ -1,11 +1,13 @@
 """A map-style PyTorch dataset of moments in executions, each with the memory of its history."""
 
-import operator
+import hashlib
 import os
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, SHIFTED, STATE
@@ -14,42 +16,28 @@ from robomme_interference_data.data.dataset import camera_feature
 from robomme_interference_data.data.loading import load_buffer_set, open_cache
 from robomme_interference_data.data.state_reader import other_state_sizes, query_state_size
 from robomme_interference_data.data.views import shifted_view
-from robomme_interference_data.errors import (
-    HashMismatchError,
-    InterferenceError,
-    InvalidOptionError,
-)
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.stored_selector import StoredSelector
+from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import parse_condition
-from robomme_interference_data.schema.manifest import ManifestHeader
 from robomme_interference_data.schema.other_states import check_rule, check_sizes
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.schema.shifts import NO_SHIFT, Shift, parse_shift
-from robomme_interference_data.storage.files import LocalFiles
+from robomme_interference_data.storage.text import digest_json
 
+from .batches import Batches, Drawn
 from .draws import Weights
-from .histories import DrawnHistory, Histories
+from .histories import Histories
+from .items import Items, item_of
 from .moments import check_arguments, check_size, choose_moments, drawable_rows, needed_datasets
 from .question_tensors import QuestionTensors
-from .rows import PADDING, StoredRows
+from .reopening import reduced
+from .rows import StoredRows
 
 if TYPE_CHECKING:
-    import torch
-
     from robomme_interference_data.storage.cache import DecodedCache
-
-
-class _Drawn(NamedTuple):
-    """What the draws make of an index: a moment of an episode, given by number, and its history."""
-
-    item: int
-    number: int
-    moment: int
-    condition: str
-    shift: str
-    history: DrawnHistory
 
 
 class HistoryDataset:
@@ -82,8 +70,9 @@ class HistoryDataset:
     - `task`: the goal; `condition`, `shift`, `episode_id`: text;
     - `frame_index`: `() int64`, t; `index`: `() int64`, the item's index.
 
-    A list of indices gives a batch, with all entries as `default_collate` makes them of the items,
-    but faster; for `DataLoader(data, batch_size=None, sampler=BatchSampler(…))`.
+    Several indices (a list, tuple, slice, array or tensor) give a batch, with all entries as
+    `default_collate` makes them of the items, but faster. `DataLoader(data, batch_size)` gets its
+    batches in this way.
 
     Args:
         buffer_set: Folder, `namespace/name` on the Hub, or a `BufferSet`.
@@ -94,6 +83,7 @@ class HistoryDataset:
         image_size: Side of the images in pixels, see `resize`; None for no change of size.
         chunk: Actions per item. If 0, items have no actions and there is one per episode: the
             first live moment. Then the buffer set needs no executions.
+        split: Split of the query episodes to use. Train on no others than `train`.
         families: Families to use; empty for all.
         episodes: Indices of the query episodes to use, such as `0-79`; None for all.
         retrieval: Encoder of a retrieval step before the memory, such as `thumbnail`; its index
@@ -129,6 +119,7 @@ class HistoryDataset:
         cameras: Sequence[str] | None = None,
         image_size: int | None = None,
         chunk: int = 16,
+        split: str = "train",
         families: Sequence[str] = (),
         episodes: str | None = None,
         retrieval: str | None = None,
@@ -152,9 +143,9 @@ class HistoryDataset:
             cameras = (self.buffer_set.datasets[DEMONSTRATIONS].camera(),)
         self._arguments = dict(
             conditions=conditions, memory=memory, cameras=cameras, image_size=image_size,
-            chunk=chunk, families=tuple(families), episodes=episodes, retrieval=retrieval,
-            retrieval_rule=retrieval_rule, retrieval_camera=retrieval_camera, shifts=shifts,
-            questions=questions, redraw=redraw, unit_episodes=unit_episodes,
+            chunk=chunk, split=split, families=tuple(families), episodes=episodes,
+            retrieval=retrieval, retrieval_rule=retrieval_rule, retrieval_camera=retrieval_camera,
+            shifts=shifts, questions=questions, redraw=redraw, unit_episodes=unit_episodes,
             other_states=other_states, seed=seed, cache=cache,
         )  # fmt: skip
         self.memory, self.seed = Memory.parse(memory), seed
@@ -192,7 +183,7 @@ class HistoryDataset:
         check_sizes(what, query_state_size(datasets), others, rule)
         self._rows = StoredRows(datasets, kept, size, rule)
         self._moments = choose_moments(
-            self.buffer_set, self._rows, families, episodes, actions=actions
+            self.buffer_set, self._rows, split, families, episodes, actions=actions
         )
         draws = (seed, units) if redraw else None
         self._histories = Histories(self.buffer_set, self._rows, step, draws)
@@ -210,24 +201,20 @@ class HistoryDataset:
         self._rows.prepare((*self.cameras, STATE), np.concatenate([now, history]), quiet=quiet)
         if actions:
             self._rows.prepare((ACTION,), now, quiet=quiet)
-        # All items have as many places, so that they can be batched.
-        self._size = self.memory_frames
-        import torch
-
+        self._batches = Batches(
+            self._rows,
+            self._moments,
+            self.memory,
+            self.cameras,
+            self.chunk,
+            self.memory_frames,
+            self._histories.parts,
+        )
         # Shared with the processes of a loader, which have copies of the dataset.
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        files = self.buffer_set.files
-        # Another process may have another working directory.
-        location = str(files.root.absolute()) if isinstance(files, LocalFiles) else files.location
-        return _open_again, (
-            location,
-            self._arguments,
-            self._epoch,
-            self.buffer_set.header,
-            self.episode_ids,
-        )
+        return reduced(self, self._arguments)
 
     def __len__(self) -> int:
         """Return the number of items."""
@@ -251,6 +238,22 @@ class HistoryDataset:
             return self.memory.frames - 1
         return self._histories.longest + self._moments.most - 1
 
+    @cached_property
+    def content(self) -> str:
+        """Digest of what the items are of: header, episodes, and rows of the planned histories.
+
+        In another process that opened the same buffer set again, an index means the same item if
+        this is the same.
+        """
+        rows = [self._moments.first, self._histories.rows]
+        return digest_json(
+            [
+                to_dict(self.buffer_set.header),
+                [str(episode) for episode in self.episode_ids],
+                *(hashlib.sha256(one.tobytes()).hexdigest() for one in rows),
+            ]
+        )
+
     @property
     def epoch(self) -> int:
         """The epoch, from 0."""
@@ -268,71 +271,27 @@ class HistoryDataset:
         """
         return self._moments.index_of(EpisodeId.parse(episode_id), frame_index)
 
-    def __getitem__(self, index: int | list[int]) -> dict[str, Any]:
-        """Return an item, or for a list of indices a batch; see the class."""
-        if isinstance(index, list):
-            return self._batch([self._drawn(number) for number in index])
-        batch = self._batch([self._drawn(index)])
-        options = batch.pop("question.options", None)
-        item = {name: values[0] for name, values in batch.items()}
-        return (
-            item
-            if options is None
-            else item | {"question.options": [texts for (texts,) in options]}
-        )
+    def __getitem__(self, index: Any) -> dict[str, Any]:
+        """Return an item, or for several indices a batch; see the class."""
+        indices = np.asarray(range(len(self))[index] if isinstance(index, slice) else index)
+        return self._batch(indices) if indices.ndim else item_of(self._batch(indices[None]), 0)
 
-    def _drawn(self, index: int) -> _Drawn:
-        index = operator.index(index)  # draws depend on its text: a tensor has another
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"index {index} of {len(self)} items")
-        index %= len(self)
-        epoch, (number, moment) = self.epoch, self._moments.locate(index)
-        condition = self._conditions.draw("condition", self.seed, epoch, index)
-        shift = self._shifts.draw("shift", self.seed, epoch, index)
-        episode = self.episode_ids[number]
-        history = self._histories.get(epoch, episode, condition, self._shift_of[shift])
-        return _Drawn(index, number, moment, condition, shift, history)
+    def __getitems__(self, indices: Sequence[int]) -> Items:
+        """Return the items of a batch, of which `default_collate` makes the batch at once.
 
-    def _batch(self, items: Sequence[_Drawn]) -> dict[str, Any]:
-        import torch
+        PyTorch's loaders call it.
+        """
+        return Items(self._batch(np.asarray(indices)))
 
-        places = len(items), self._size
-        rows, position = np.full(places, PADDING), np.zeros(places, np.int64)
-        is_pad = np.ones(places, bool)
-        evidence = np.zeros((*places, self._histories.parts), bool)
-        for place, drawn in enumerate(items):
-            past, shown = drawn.history.rows, drawn.history.evidence
-            kept = np.asarray(self.memory.earlier(len(past) + drawn.moment), np.int64)
-            count, ended = len(kept), int(kept.searchsorted(len(past)))
-            rows[place, :ended] = past[kept[:ended]]
-            # Frames after the history are of the execution, which begins at its own row.
-            rows[place, ended:count] = kept[ended:] + (
-                self._moments.first[drawn.number] - len(past)
-            )
-            position[place, :count], is_pad[place, :count] = kept, False
-            if shown is not None:
-                evidence[place, :ended] = shown[kept[:ended]]
-        moment = np.array([drawn.moment for drawn in items])
+    def _batch(self, indices: NDArray[np.integer]) -> dict[str, Any]:
+        """Return a batch, with all its entries."""
+        if indices.ndim != 1 or indices.dtype.kind not in "iu" or not len(indices):
+            given = f"indices of type {indices.dtype} and shape {indices.shape}"
+            raise IndexError(f"{given}; expected one integer or several")
+        items = [self._drawn(index) for index in indices.tolist()]
         numbers = [drawn.number for drawn in items]
-        first = self._moments.first[numbers]
-        now = np.array([self._current_row(drawn) for drawn in items])
-        batch: dict[str, Any] = {}
-        for name in (*self.cameras, STATE):
-            batch[name] = self._rows.take(name, now)
-            batch[f"memory.{name.removeprefix('observation.')}"] = self._rows.take(name, rows)
-        batch["memory.position"], batch["memory.is_pad"] = position, is_pad
-        batch["memory.evidence"] = evidence
-        batch["evidence_known"] = np.array([drawn.history.evidence is not None for drawn in items])
-        batch["position"] = moment + [len(drawn.history.rows) for drawn in items]
-        if self.chunk:
-            steps = moment[:, None] + np.arange(self.chunk)
-            last = self._moments.actions[numbers][:, None] - 1
-            # After the end the last action repeats, as LeRobot pads its chunks.
-            batch[ACTION] = self._rows.take(ACTION, first[:, None] + np.minimum(steps, last))
-            batch["action_is_pad"] = steps > last
-        batch["frame_index"] = moment
-        batch["index"] = np.array([drawn.item for drawn in items])
         episodes = [self.episode_ids[number] for number in numbers]
+        arrays = self._batches.arrays(items)
         texts = {
             "task": [self.buffer_set.query(episode).goal for episode in episodes],
             "condition": [drawn.condition for drawn in items],
@@ -340,12 +299,21 @@ class HistoryDataset:
             "episode_id": [str(episode) for episode in episodes],
         }
         if self._questions is not None:
-            batch |= self._questions.arrays(numbers)
+            arrays |= self._questions.arrays(numbers)
             texts |= self._questions.texts(numbers)
-        return {name: torch.from_numpy(values) for name, values in batch.items()} | texts
+        return {name: torch.from_numpy(values) for name, values in arrays.items()} | texts
 
-    def _current_row(self, drawn: _Drawn) -> int:
-        return self._view_row(drawn.number, self._shift_of[drawn.shift]) + drawn.moment
+    def _drawn(self, index: int) -> Drawn:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"index {index} of {len(self)} items")
+        index %= len(self)
+        epoch, (number, moment) = self.epoch, self._moments.locate(index)
+        condition = self._conditions.draw("condition", self.seed, epoch, index)
+        shift = self._shifts.draw("shift", self.seed, epoch, index)
+        drawn = self._shift_of[shift]
+        history = self._histories.get(epoch, self.episode_ids[number], condition, drawn)
+        now = self._view_row(number, drawn) + moment
+        return Drawn(index, number, moment, condition, shift, history, now)
 
     def _view_row(self, number: int, shift: Shift | None) -> int:
         """Return the row of the first live view of an episode, given by its number."""
@@ -358,39 +326,3 @@ class HistoryDataset:
         """Return the rows of the first live views; those of later ones belong to the same spans."""
         numbers, shifts = range(len(self.episode_ids)), self._shift_of.values()
         return np.array([self._view_row(number, shift) for shift in shifts for number in numbers])
-
-
-class _Unusable:
-    """A dataset that another process cannot open again.
-
-    A loader reports errors of items in the process that trains, but an error while a dataset is
-    unpickled only ends its worker.
-    """
-
-    def __init__(self, error: InterferenceError):
-        self._error = error
-
-    def __getitem__(self, index: object) -> Any:
-        raise self._error
-
-
-def _open_again(
-    location: str,
-    arguments: dict[str, Any],
-    epoch: "torch.Tensor",
-    header: ManifestHeader,
-    episodes: tuple[EpisodeId, ...],
-) -> HistoryDataset | _Unusable:
-    """Return a dataset in another process; memory maps and tables cannot be pickled."""
-    try:
-        made = HistoryDataset(location, **arguments, quiet=True)
-        # Items are numbered over all episodes: in a set that grew, an index means another moment.
-        if (made.buffer_set.header, made.episode_ids) != (header, episodes):
-            raise HashMismatchError(
-                f"{location} was changed since the training began: a worker finds other buffers",
-                "Start the training again; do not change a buffer set that is in use.",
-            )
-    except InterferenceError as error:
-        return _Unusable(error)
-    made._epoch = epoch
-    return made

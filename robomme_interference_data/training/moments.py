@@ -7,7 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import CONTRADICTIONS, DEMONSTRATIONS, EXECUTIONS, SHIFTED
+from robomme_interference_data.constants import (
+    CONTRADICTIONS,
+    DEMONSTRATIONS,
+    EXECUTIONS,
+    SHIFTED,
+    SPLITS,
+)
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.loading import open_dataset
@@ -117,12 +123,22 @@ class Moments:
 def choose_moments(
     buffer_set: BufferSet,
     rows: StoredRows,
+    split: str,
     families: Sequence[str],
     episodes: str | None,
     *,
     actions: bool,
 ) -> Moments:
     """Return the moments of executions, or the first live views where actions are not needed."""
+    there = {episode.split for episode in buffer_set.episode_ids}
+    if split not in there:
+        names = " or ".join(repr(name) for name in SPLITS if name in there)
+        raise InvalidOptionError.expected(
+            "split",
+            split,
+            f"{names}: {buffer_set.location} has no other episodes",
+            "Train on train episodes only; for others, give their split.",
+        )
     known = buffer_set.families
     for family in families:
         if family not in known:
@@ -137,13 +153,14 @@ def choose_moments(
     chosen = tuple(
         episode
         for episode in buffer_set.episode_ids
-        if episode.family in (families or known)
+        if episode.split == split
+        and episode.family in (families or known)
         and (numbers is None or episode.index in numbers)
         and episode in recorded
     )
     missing = (numbers or frozenset()) - {episode.index for episode in chosen}
     if missing or not chosen:
-        expected = f"indices of episodes in the {live.kind} of {buffer_set.location}"
+        expected = f"indices of {split} episodes in the {live.kind} of {buffer_set.location}"
         hint = f"They lack {format_numbers(sorted(missing))}." if missing else None
         raise InvalidOptionError.expected("episodes", episodes, expected, hint)
     records = [recorded[episode] for episode in chosen]

@@ -77,7 +77,9 @@ def test_recordings_without_states(tmp_path: Path, run: Any) -> None:
     assert code == 0, err
     code, out, err = run("card", root)
     assert code == 0 and "no robot states" in out, err
-    history = HistoryDataset(root, ["k1"], memory="framesamp:4", chunk=2, cache=tmp_path / "cache")
+    history = HistoryDataset(
+        root, ["k1"], split="test", memory="framesamp:4", chunk=2, cache=tmp_path / "cache"
+    )
     item = history[0]
     assert item["observation.state"].shape == (0,)
     assert item["memory.state"].shape == (3, 0)

@@ -98,6 +98,7 @@ def test_the_model_gets_what_an_item_of_training_holds(
     data = HistoryDataset(
         buffer_set,
         [condition],
+        split="test",
         memory=memory,
         cameras=policy.cameras,
         image_size=24,

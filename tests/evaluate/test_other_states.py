@@ -94,6 +94,7 @@ def test_digests_are_compared_with_the_recorded_states(
 
 def test_memories_for_training(narrower: Path, tmp_path: Path) -> None:
     options: Any = {"cache": tmp_path, "quiet": True, "memory": "full", "chunk": 0}
+    options["split"] = "test"
     with raises(InvalidOptionError) as caught:
         HistoryDataset(narrower, ["k1"], **options)
     assert caught.value.option == "other_states"

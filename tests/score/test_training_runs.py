@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from scipy import stats
 from support import scoring as made
+from support.messages import raises
 from support.null_rows import NullGrid
 from support.scoring import BASE, OWN, cells, record, records
 
+from robomme_interference_data.errors import FormatError
 from robomme_interference_data.evaluate.run.row import Rollout
 from robomme_interference_data.evaluate.score.compare import compare
+from robomme_interference_data.evaluate.score.rows.reading import read_rows
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.stats.bootstrap import Interval
@@ -175,6 +178,17 @@ def test_a_training_seed_tells_rollouts_apart(tmp_path: Path) -> None:
     # Rows without one are of a single run.
     unknown = made.changed(cells({(OWN, "k0"): "sf"}), training_seed=None)
     assert record(scored(tmp_path, unknown), "main", condition="k0")["runs"] == 1
+
+
+def test_weights_of_different_steps_are_not_one_system(tmp_path: Path) -> None:
+    """Also of different training runs; what most rows have counts."""
+    rows = trained({seed: {"k0": "ssff"} for seed in range(3)})
+    mixed = [replace(row, training_step=500 if row.training_seed == 2 else 600) for row in rows]
+    path = made.write_parquet(tmp_path / "mixed.parquet", mixed)
+    with raises(FormatError):
+        read_rows([path])
+    found = read_rows([path], lenient=True)
+    assert found.bad_count == 4 and {row.training_step for row in found.rows} == {600}
 
 
 # --- errors ------------------------------------------------------------------------------------

@@ -67,7 +67,7 @@ def test_classes_take_the_first_camera(arm: Path) -> None:
     assert selector.identity(buffer)["camera"] == "hand"
     assert selector.label(buffer.query.dataset).startswith("thumbnail@hand/max")
     assert len(selector.select(buffer, first))
-    items = HistoryDataset(arm, ["k1"], retrieval="thumbnail", quiet=True)
+    items = HistoryDataset(arm, ["k1"], split="test", retrieval="thumbnail", quiet=True)
     assert items.cameras == ("observation.images.hand",)
 
 

@@ -294,7 +294,9 @@ def test_no_reader_takes_rows_that_the_rules_do_not_give(
     def train() -> object:
         from robomme_interference_data.training import HistoryDataset
 
-        return HistoryDataset(root, conditions=("k1",), cameras=("front",), chunk=0, quiet=True)
+        return HistoryDataset(
+            root, conditions=("k1",), split="test", cameras=("front",), chunk=0, quiet=True
+        )
 
     read: dict[str, Callable[[], object]] = {
         "evaluate": lambda: evaluate(tmp_path / "run", conditions=("k1",), families=("MoveCube",)),

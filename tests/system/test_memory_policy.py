@@ -1,6 +1,7 @@
 """The example `examples/memory_policy`: it trains, resumes, answers, and acts in rollouts."""
 
 import csv
+import json
 import re
 import shutil
 import sys
@@ -21,7 +22,7 @@ from robomme_interference_data.evaluate.score.rows.reading import read_rows
 from robomme_interference_data.runtime.executor import Serial
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "memory_policy"
-SMALL = ("--image-size", "16", "--batch", "4", "--device", "cpu")
+SMALL = ("--image-size", "16", "--batch", "4", "--device", "cpu", "--split", "test")
 
 
 @pytest.fixture(autouse=True)
@@ -78,7 +79,9 @@ def test_actions_need_not_have_the_size_of_states() -> None:
 
 
 @pytest.mark.slow
-def test_it_learns_to_answer_and_writes_rows(program: Any, tmp_path: Path) -> None:
+def test_it_learns_to_answer_and_writes_rows(
+    program: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Of six golden lessons: their frames are of one color each, so not all can be told apart."""
     run, families = tmp_path / "run", ("VideoRepick", "MoveCube", "InsertPeg")
     options = ("--conditions", "k0", "--steps", 140, "--families", ",".join(families))
@@ -92,6 +95,10 @@ def test_it_learns_to_answer_and_writes_rows(program: Any, tmp_path: Path) -> No
     program("answer", run, TABLETOP, "--system", "learned-k0", "--out", out)
     rows = read_rows([out]).rows
     assert len(rows) == 3 * 18 and {row.model_seed for row in rows} == {3}
+    assert {row.training_step for row in rows} == {140}
+    assert "not finished" not in capsys.readouterr().err
+    config = json.loads((run / "config.json").read_text())
+    (run / "config.json").write_text(json.dumps(config | {"training_steps": 200}))
     assert {row.condition for row in rows} == {"no-history", "k0", "k1"}
     assert {row.revision for row in rows} == {load_buffer_set(TABLETOP).revision}
     seen = [row.success for row in rows if row.condition == "k0" and row.family in families]
@@ -107,6 +114,7 @@ def test_it_learns_to_answer_and_writes_rows(program: Any, tmp_path: Path) -> No
     rows = read_rows([retrieved]).rows
     assert {row.condition for row in rows} == {"k0", "k1"}  # no-history does not apply
     assert {row.retrieval for row in rows} == {"thumbnail/max/adaptive"}
+    assert "not finished, step 140 of 200" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -127,6 +135,8 @@ def test_an_interrupted_run_ends_like_another(
     monkeypatch.setattr(sys.modules["train"], "train_step", interrupted)
     with raises(SystemExit):
         program("train", executed_buffers, "--out", parts, *settings, *SMALL)
+    kept = json.loads((parts / "config.json").read_text())
+    assert (kept["training_step"], kept["training_steps"]) == (2, 6)
     monkeypatch.setattr(sys.modules["train"], "train_step", step)
     with raises(SystemExit):
         program("train", executed_buffers, "--out", parts, *settings, *SMALL, "--seed", 1)
@@ -197,7 +207,7 @@ def test_the_pages_commands_and_its_example(
     (tmp_path / "my-training").symlink_to(executed_buffers)
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
-    exec(code.replace("image_size=96", "image_size=16"), names)  # of 32 pixels
+    exec(code.replace("image_size=96", 'image_size=16, split="test"'), names)  # of 32 pixels
     item = names["item"]
     assert item["memory.images.front"].shape == (31, 3, 16, 16) and item["action"].shape == (16, 8)
 
@@ -251,7 +261,7 @@ def test_questions_with_other_points(places: int, program: Any, tmp_path: Path) 
     program("train", TABLETOP, "--out", run, *options)
     model = sys.modules["memory_model"].load_checkpoint(run)
     data = sys.modules["train"].HistoryDataset(
-        TABLETOP, ["k0"], image_size=16, chunk=0, questions=True, quiet=True
+        TABLETOP, ["k0"], split="test", image_size=16, chunk=0, questions=True, quiet=True
     )
     batch = data[[*range(len(data))]]
     trained = batch["question.points"].shape[2]
@@ -277,7 +287,14 @@ def test_scores_do_not_depend_on_the_rest_of_the_batch(program: Any, tmp_path: P
     model = sys.modules["memory_model"].load_checkpoint(run)
     assert {layer.self_attn.dropout for layer in model.trunk.layers} == {0}
     data = sys.modules["train"].HistoryDataset(
-        TABLETOP, ["k0", "k1"], memory="full", image_size=16, chunk=0, questions=True, quiet=True
+        TABLETOP,
+        ["k0", "k1"],
+        split="test",
+        memory="full",
+        image_size=16,
+        chunk=0,
+        questions=True,
+        quiet=True,
     )
     batch = data[[*range(len(data))]]
     frames, choices = (~batch["memory.is_pad"]).sum(1), (~batch["question.option_is_pad"]).sum(1)

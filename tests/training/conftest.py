@@ -29,7 +29,7 @@ def make(buffers: Path, tmp_path_factory: pytest.TempPathFactory) -> Make:
     store = tmp_path_factory.mktemp("cache")
 
     def call(conditions: Any = ("k3",), **options: Any) -> HistoryDataset:
-        usual: dict[str, Any] = {"cache": store, "quiet": True, "image_size": 16}
+        usual: dict[str, Any] = {"cache": store, "quiet": True, "image_size": 16, "split": "test"}
         return HistoryDataset(buffers, conditions, **usual | options)
 
     return call

@@ -118,7 +118,13 @@ def test_views_under_shifts(make: Make, buffers: Path) -> None:
 
 @pytest.mark.slow
 def test_questions_as_tensors(tmp_path: Path) -> None:
-    options: dict[str, Any] = {"chunk": 0, "questions": True, "cache": tmp_path, "quiet": True}
+    options: dict[str, Any] = {
+        "split": "test",
+        "chunk": 0,
+        "questions": True,
+        "cache": tmp_path,
+        "quiet": True,
+    }
     data = HistoryDataset(TABLETOP, ["k0"], image_size=8, **options)
     questions = read_questions(load_buffer_set(TABLETOP))
     for number, episode in enumerate(data.episode_ids):
@@ -155,17 +161,60 @@ def test_a_batch_is_the_collated_items(memory: str, make: Make) -> None:
     collated = default_collate([data[index] for index in indices])
     assert {*collated["condition"]} == {"no-history", "k0", "k3"}
     same(data[indices], collated)
-    sampler = torch.utils.data.BatchSampler(indices, 6, drop_last=False)
-    loader = torch.utils.data.DataLoader(data, None, sampler=sampler, num_workers=2)
-    for batch, chosen in zip(loader, sampler, strict=True):
-        same(batch, data[chosen])
     with raises(IndexError):
         data[[0, 3 * LIVE]]
 
 
+def test_loaders_get_whole_batches(make: Make) -> None:
+    data = make({"no-history": 1, "k0": 1, "k3": 1}, memory="framesamp:8")
+    indices = [5, 0, 5, 2 * LIVE, LIVE - 1, *range(90, 99), -1]
+    for workers in (0, 2):
+        loader = torch.utils.data.DataLoader(data, 6, sampler=indices, num_workers=workers)
+        for number, batch in enumerate(loader):
+            same(batch, data[indices[6 * number : 6 * number + 6]])
+    part = torch.utils.data.Subset(data, indices)
+    [batch] = torch.utils.data.DataLoader(part, len(indices))
+    same(batch, data[indices])
+    # A collation of one's own gets items, as many as it likes.
+    own = torch.utils.data.DataLoader(data, 4, sampler=indices, collate_fn=list)
+    items = [item for batch in own for item in batch]
+    same(default_collate(items[:3]), data[indices[:3]])
+    assert len(items) == len(indices) and items[-1]["index"] == len(data) - 1
+
+
+def test_kinds_of_indices(make: Make) -> None:
+    data = make({"k0": 1, "k3": 1}, chunk=0)
+    whole = data[[0, 1, 2]]
+    several = (slice(None), (0, 1, 2), np.arange(3), torch.arange(3), range(3), data[:]["index"])
+    for index in several:
+        same(data[index], whole)
+    for index in (2, -1, np.int64(2), np.array(2), torch.tensor(2)):
+        assert data[index]["episode_id"] == whole["episode_id"][2]
+    same(data[::2], data[[0, 2]])
+    same(data[torch.tensor([1])], data[[1]])
+    for wrong in ([], [0.5], 0.5, torch.tensor([True, False, True]), [[0]], "1", 3, -4):
+        with raises(IndexError):
+            data[wrong]
+
+
+def test_episodes_of_one_split(make: Make, buffers: Path) -> None:
+    """The golden buffer set has test episodes; no other is trained on unless it is named."""
+    assert {one.split for one in make(["k0"]).episode_ids} == {"test"}
+    for split in ("train", "trian"):
+        with raises(InvalidOptionError) as raised:
+            HistoryDataset(buffers, ["k0"], **({} if split == "train" else {"split": split}))
+        assert raised.value.option == "split" and "'test'" in str(raised.value)
+
+
 @pytest.mark.slow
 def test_a_batch_of_questions_and_shifts(make: Make, tmp_path: Path) -> None:
-    options: dict[str, Any] = {"chunk": 0, "questions": True, "cache": tmp_path, "quiet": True}
+    options: dict[str, Any] = {
+        "split": "test",
+        "chunk": 0,
+        "questions": True,
+        "cache": tmp_path,
+        "quiet": True,
+    }
     asked = HistoryDataset(TABLETOP, ["k0"], image_size=8, **options)
     shifted = make(["k0"], chunk=0, shifts={"none": 1, str(SHIFTS[2]): 1}, seed=3)
     assert len({shifted[index]["shift"] for index in range(3)}) == 2
@@ -215,7 +264,9 @@ def test_a_buffer_set_without_executions(tiny_buffers: Path, tmp_path: Path) -> 
     with raises(MissingFileError) as raised:
         HistoryDataset(tiny_buffers, ["k0"], cache=tmp_path)
     assert raised.value.command == f"build {tiny_buffers} --only executions --source KIND:PATH"
-    assert HistoryDataset(tiny_buffers, ["k0"], chunk=0, cache=tmp_path, quiet=True)[0]
+    assert HistoryDataset(tiny_buffers, ["k0"], split="test", chunk=0, cache=tmp_path, quiet=True)[
+        0
+    ]
 
 
 @pytest.mark.slow
@@ -223,7 +274,7 @@ def test_manifests_planned_before_the_executions(executed_buffers: Path, tmp_pat
     root = copy_buffer_set(tmp_path / "buffers", executed_buffers)
     shutil.copytree(GOLDEN / MANIFESTS, root / MANIFESTS, dirs_exist_ok=True)
     with pytest.raises(MissingFileError) as caught:
-        HistoryDataset(root, ["k0"], cache=tmp_path)
+        HistoryDataset(root, ["k0"], split="test", cache=tmp_path)
     assert str(caught.value.command).endswith("--only manifests")
     plan_again(root)
-    assert len(HistoryDataset(root, ["k0"], cache=tmp_path, quiet=True)) == 3 * LIVE
+    assert len(HistoryDataset(root, ["k0"], split="test", cache=tmp_path, quiet=True)) == 3 * LIVE

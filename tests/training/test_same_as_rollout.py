@@ -99,6 +99,7 @@ def test_same_frames_states_and_positions(
     data = HistoryDataset(
         buffer_set,
         [condition],
+        split="test",
         memory=memory,
         cameras=CAMERAS,
         image_size=24,

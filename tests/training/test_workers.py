@@ -11,13 +11,15 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from support.buffer_sets import GOLDEN, copy_buffer_set, plan_again
+from support.buffer_sets import GOLDEN, build, copy_buffer_set, plan_again
 from support.hub import BUFFER_SET, push_buffer_set
 from support.hub_server import HubServer
 from support.messages import raises
 from support.own_dataset import BuffersDataset
+from support.retrieval import make_index
 
 from robomme_interference_data import load_buffer_set
+from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.errors import HashMismatchError
 from robomme_interference_data.training import HistoryDataset, resize
 from robomme_interference_data.training.draws import Weights
@@ -103,14 +105,39 @@ def test_spawned_workers_open_the_same_items(make: Make) -> None:
 def test_a_buffer_set_that_changed_is_an_error_of_its_items(
     executed_buffers: Path, tmp_path: Path
 ) -> None:
+    """Whatever changed: planned buffers, episodes, chosen frames, or bytes."""
     root = copy_buffer_set(tmp_path / "buffers", executed_buffers)
-    data = HistoryDataset(root, ["k0"], chunk=0, cache=tmp_path / "cache", quiet=True)
-    same = pickle.dumps(data)
+    make_index(root)
+    options: Any = {"split": "test", "chunk": 0, "cache": tmp_path / "cache", "quiet": True}
+    data = HistoryDataset(root, ["k0"], **options)
+    retrieving = HistoryDataset(root, ["k3"], retrieval="thumbnail", **options)
+    same, retrieved = pickle.dumps(data), pickle.dumps(retrieving)
     for copied in (pickle.loads(same), copy.deepcopy(data)):
         assert copied[0]["episode_id"] == data[0]["episode_id"]
-    plan_again(root, ["k0", "k1"])
+    assert torch.equal(
+        pickle.loads(retrieved)[0]["memory.position"], retrieving[0]["memory.position"]
+    )
+    plan_again(root, ["no-history", "k0", "k3"])
+    for pickled in (same, retrieved):
+        with raises(HashMismatchError):
+            pickle.loads(pickled)[0]
+
+
+def test_a_buffer_set_that_grew_is_an_error_of_its_items(
+    executed_buffers: Path, tmp_path: Path
+) -> None:
+    """One more test episode before the others: an index would mean another episode."""
+    root = copy_buffer_set(tmp_path / "buffers")
+    options: Any = {"split": "test", "chunk": 0, "cache": tmp_path / "cache", "quiet": True}
+    data = HistoryDataset(root, ["k0"], **options)
+    pickled = pickle.dumps(data)
+    families = ("VideoRepick", "MoveCube", "PatternLock", "InsertPeg")
+    build(root, "demonstrations", SampleSource(size=32), families=families, split="test")
+    plan_again(root, ["k0"])
+    grown = HistoryDataset(root, ["k0"], **options)
+    assert grown[2]["episode_id"] != data[2]["episode_id"]
     with raises(HashMismatchError):
-        pickle.loads(same)[0]
+        pickle.loads(pickled)[2]
 
 
 @pytest.mark.slow
@@ -127,7 +154,7 @@ def test_a_users_own_dataset_in_workers(method: str) -> None:
 @pytest.mark.slow
 def test_a_spawned_worker_reports_a_changed_set(executed_buffers: Path, tmp_path: Path) -> None:
     root = copy_buffer_set(tmp_path / "buffers", executed_buffers)
-    data = HistoryDataset(root, ["k0"], chunk=0, cache=tmp_path / "cache", quiet=True)
+    data = HistoryDataset(root, ["k0"], split="test", chunk=0, cache=tmp_path / "cache", quiet=True)
     plan_again(root, ["k0", "k1"])
     loader = torch.utils.data.DataLoader(data, num_workers=1, multiprocessing_context="spawn")
     with pytest.raises(HashMismatchError) as raised:
@@ -154,7 +181,12 @@ def test_units_that_may_not_be_drawn_are_not_stored(make: Make, buffers: Path, t
 
 def test_only_the_videos_in_use_are_downloaded(hub: HubServer, tmp_path: Path) -> None:
     push_buffer_set(hub, GOLDEN, tmp_path / "work")
-    options: dict[str, Any] = {"chunk": 0, "cache": tmp_path / "cache", "quiet": True}
+    options: dict[str, Any] = {
+        "split": "test",
+        "chunk": 0,
+        "cache": tmp_path / "cache",
+        "quiet": True,
+    }
     data = HistoryDataset(BUFFER_SET, ["k1"], families=["MoveCube"], **options)
     assert len(data) == 1
     videos = [path for path in hub.downloads() if path.startswith("videos/")]

@@ -54,6 +54,7 @@ class Row(NamedTuple):
     evidence_kept: float | None
     policy: str | None
     policy_id: str | None
+    training_step: int | None
     memory: str | None
     retrieval: str | None
     subgoals: str | None
@@ -152,6 +153,7 @@ def parse(name: str, value: Any) -> Any:
         case (
             "episode"
             | "training_seed"
+            | "training_step"
             | "model_seed"
             | "seed"
             | "steps"
