@@ -1,4 +1,4 @@
-"""Make the pictures of docs/simulators.md: what episodes are, and how shifts look."""
+"""Make the pictures of docs/reference/tabletop.md: what episodes are, and how shifts look."""
 
 from collections.abc import Sequence
 from contextlib import closing

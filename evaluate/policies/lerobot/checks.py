@@ -93,11 +93,15 @@ def check_features(path: str, config: Any, before: Any, memory: Memory | None) -
     if memory is not None and config.n_obs_steps != 1:
         wrong.append(f"has a memory and n_obs_steps={config.n_obs_steps}; expected 1 with a memory")
     if wrong:
-        raise PolicyError(
-            f"the policy {path} does not fit: it {'; it '.join(wrong)}",
-            f"Train it on {FRONT}, {WRIST}, {STATE} and {ACTION} of a buffer set's executions; "
-            "see docs/how-to/connect-a-policy.md.",
-        )
+        if memory is None:
+            how = (
+                f"Train it on {FRONT}, {WRIST}, {STATE} and {ACTION} of a buffer set's executions; "
+            )
+            how += "see docs/how-to/connect-a-policy.md."
+        else:
+            how = "Train it with robomme-interference train, which makes all its images squares of "
+            how += "`image_size`; see docs/how-to/train-a-policy.md."
+        raise PolicyError(f"the policy {path} does not fit: it {'; it '.join(wrong)}", how)
 
 
 def _provided(config: Any, memory: Memory | None) -> dict[str, tuple[int, ...]]:
