@@ -7,6 +7,7 @@ below `label.`.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -100,12 +101,15 @@ class LeRobotReads:
     Attributes:
         episodes: None: all episodes of `meta` are in use.
         absolute_to_relative_idx: None: indices of items are those of `meta`.
-        meta: What it is asked beside items.
     """
 
     episodes = None
     absolute_to_relative_idx = None
-    meta: "LeRobotMeta"
+
+    @cached_property
+    def meta(self) -> "LeRobotMeta":
+        """What it is asked beside items."""
+        raise NotImplementedError
 
     @property
     def num_frames(self) -> int:

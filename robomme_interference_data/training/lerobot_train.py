@@ -35,7 +35,7 @@ from .history_dataset import HistoryDataset
 
 
 @dataclass
-class TrainingData(DatasetConfig):
+class TrainingData(DatasetConfig):  # type: ignore[misc]
     """The data of a training, which LeRobot saves in each checkpoint's `train_config.json`.
 
     Of LeRobot's own settings, `repo_id`, `root`, `revision`, `episodes`, `image_transforms`,
@@ -64,7 +64,7 @@ class TrainingData(DatasetConfig):
 
 
 @dataclass
-class TrainingConfig(TrainPipelineConfig):
+class TrainingConfig(TrainPipelineConfig):  # type: ignore[misc]
     """LeRobot's settings of a training, with a buffer set as dataset."""
 
     dataset: TrainingData
@@ -187,7 +187,7 @@ def _indices(buffer_set: BufferSet, split: str) -> list[int]:
     return sorted({one.index for one in buffer_set.episode_ids if one.split == split})
 
 
-class _Sampler(EpisodeAwareSampler):
+class _Sampler(EpisodeAwareSampler):  # type: ignore[misc]
     """LeRobot's sampler, which sets the epoch of the data when it begins one, also on resume."""
 
     data: HistoryDataset
@@ -240,7 +240,7 @@ def train(arguments: Sequence[str]) -> None:
         lerobot_train.EpisodeAwareSampler = type("Sampler", (_Sampler,), {"data": made[0]})
         return made
 
-    @parser.wrap()
+    @parser.wrap()  # type: ignore[untyped-decorator]
     def run(config: TrainingConfig) -> None:
         # Without the parser of LeRobot's own settings around it.
         lerobot_train.train.__wrapped__(config)
