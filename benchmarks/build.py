@@ -26,7 +26,6 @@ from robomme_interference_data.build_dataset.dataset.lerobot_writer import (
 )
 from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan, PlannedEpisode
 from robomme_interference_data.build_dataset.dataset.stage import StageTask
-from robomme_interference_data.build_dataset.dataset.statistics import ImageStats
 from robomme_interference_data.build_dataset.plan.episodes import choose_episodes
 from robomme_interference_data.build_dataset.sources import (
     Frame,
@@ -40,6 +39,7 @@ from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Executor, Serial, Worker
 from robomme_interference_data.runtime.process import Processes
 from robomme_interference_data.storage.arrays import FeatureDigests
+from robomme_interference_data.storage.lerobot.statistics import ImageStats
 from robomme_interference_data.storage.video.encode import Codec, VideoEncoder, get_codec
 
 RECORDINGS = Path(__file__).resolve().parent.parent.parent / "shared" / "data"

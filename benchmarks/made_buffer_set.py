@@ -19,7 +19,6 @@ from robomme_interference_data.build_dataset.dataset.lerobot_writer import (
     StoredEpisode,
     write_lerobot,
 )
-from robomme_interference_data.build_dataset.dataset.statistics import STATISTICS
 from robomme_interference_data.build_dataset.sources import Robot
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
@@ -32,6 +31,7 @@ from robomme_interference_data.constants import (
     WRIST,
 )
 from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.storage.lerobot.statistics import STATISTICS
 from robomme_interference_data.storage.text import read_json
 from robomme_interference_data.storage.video.encode import CODECS, VideoEncoder
 

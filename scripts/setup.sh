@@ -1,16 +1,18 @@
 #!/usr/bin/env bash
-# Makes .venv hold exactly the packages pinned in requirements.txt and this package, editable.
+# Makes .venv hold exactly the packages pinned in requirements.txt and, editable, this package and
+# the example's LeRobot policy, which LeRobot finds only if it is installed.
 # Does nothing, and says nothing, while its inputs are those of the last time.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 
 venv=.venv
 stamp=$venv/.setup
+plugin=examples/lerobot_policy_history_act
 
 say() { printf 'setup: %s\n' "$*" >&2; }
 
 # What the environment depends on; the folder too, because its scripts hold absolute paths.
-inputs() { pwd; cat requirements.txt pyproject.toml; }
+inputs() { pwd; cat requirements.txt pyproject.toml "$plugin/pyproject.toml"; }
 
 is_312() { "$1" -c 'import sys; sys.exit(sys.version_info[:2] != (3, 12))' 2>/dev/null; }
 
@@ -68,5 +70,6 @@ index=${PIP_INDEX_URL:-$("$python" -m pip config get global.index-url 2>/dev/nul
 if [[ -n $index ]]; then export UV_DEFAULT_INDEX=${UV_DEFAULT_INDEX:-$index}; fi
 "$venv/bin/uv" pip sync --quiet --python "$python" requirements.txt
 # setuptools is among the pinned packages, so the build needs nothing more from the index.
-"$venv/bin/uv" pip install --quiet --python "$python" --no-deps --no-build-isolation --editable .
+"$venv/bin/uv" pip install --quiet --python "$python" --no-deps --no-build-isolation \
+  --editable . --editable "./$plugin"
 inputs > "$stamp"

@@ -24,13 +24,17 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.files import LocalFiles
 from robomme_interference_data.storage.lerobot.dataset import LeRobotFiles
+from robomme_interference_data.storage.lerobot.statistics import (
+    Statistics,
+    before_scaling,
+    episode_statistics,
+)
 from robomme_interference_data.storage.text import read_header
 
 from .identity import BuildReport
 from .lerobot_writer import StoredEpisode
 from .plan import DatasetPlan
 from .same_simulators import check_same_simulators
-from .statistics import Statistics, before_scaling, episode_statistics
 
 
 def _advice(extend: Mapping[str, object] | None = None) -> str:

@@ -28,9 +28,8 @@ from robomme_interference_data.constants import ACTION, INFO_PATH
 from robomme_interference_data.errors import MissingExtraError
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.files import write_text
+from robomme_interference_data.storage.lerobot.statistics import STATISTICS, vector_statistics
 from robomme_interference_data.storage.video.encode import Codec
-
-from .statistics import STATISTICS, vector_statistics
 
 _ONE_EPISODE_MB = 1e-6
 """Largest size of a file, 1 byte: no two episodes share one."""

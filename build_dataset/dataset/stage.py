@@ -32,6 +32,7 @@ from robomme_interference_data.storage.arrays import (
     digest_spans,
     write_array,
 )
+from robomme_interference_data.storage.lerobot.statistics import ImageStats
 from robomme_interference_data.storage.limits import MAX_READ_VALUES
 from robomme_interference_data.storage.video.encode import Codec, VideoEncoder, get_codec
 from robomme_interference_data.storage.video.frames import iter_frames
@@ -41,7 +42,6 @@ from .frame_selection import NothingToStore, select_episodes, too_short, unit_st
 from .plan import DatasetPlan, PlannedEpisode
 from .resize import Resize
 from .staged import Staged, StagedEpisode, staged_file
-from .statistics import ImageStats
 
 
 @dataclass(frozen=True)

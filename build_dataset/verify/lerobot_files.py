@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from robomme_interference_data.build_dataset.dataset.statistics import STATISTICS
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     EPISODES_DIR,
@@ -25,6 +24,7 @@ from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.schema.codec import arrow_schema
 from robomme_interference_data.schema.records import EpisodeRecord
 from robomme_interference_data.storage.lerobot.dataset import LeRobotFiles
+from robomme_interference_data.storage.lerobot.statistics import STATISTICS
 from robomme_interference_data.storage.lerobot.tables import episode_column_names
 
 _TOLERANCE_S = 1e-4

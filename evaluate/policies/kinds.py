@@ -259,7 +259,7 @@ KINDS: dict[str, PolicyKind] = {
     "lerobot": replace(
         _LEARNED,
         form="lerobot:namespace/name[@revision] or lerobot:folder",
-        factory=f"{_HERE}.lerobot:LeRobotPolicy",
+        factory=f"{_HERE}.lerobot.policy:LeRobotPolicy",
         target="(?P<path>.+)",
         extra="build",
         not_in_identity=("source", "device"),

@@ -27,6 +27,7 @@ from robomme_interference_data.evaluate.score import commands as scoring
 from robomme_interference_data.evaluate.vla_eval import commands as vla_eval
 from robomme_interference_data.retrieval import commands as retrieving
 from robomme_interference_data.storage.hub import check_endpoint
+from robomme_interference_data.training import commands as training
 
 from . import commands, merge_command, show_command, simulate_command, verify_command
 from .console import echo, log_to_stderr, print_status, write_utf8
@@ -122,6 +123,7 @@ _GROUPS: dict[str, tuple[tuple[str, Callable[..., None]], ...]] = {
         ("show", show_command.show),
         ("simulate", simulate_command.simulate),
     ),
+    "Training": (("train", training.train),),
     "Retrieval": (
         ("index", retrieving.index),
         ("retrieve", retrieving.retrieve),

@@ -96,6 +96,15 @@ class SessionSource:
             )
         return session
 
+    def longest(self, name: str) -> SessionEntry:
+        """Return the longest session of the units in a dataset that may be drawn."""
+        allowed = self.unit_episodes
+        units = [record.episode_id for record in self.datasets[name].records()]
+        sessions = [
+            self.session(name, unit) for unit in units if allowed is None or unit.index in allowed
+        ]
+        return max(sessions, key=lambda session: session.num_frames)
+
     @cached_property
     def _queries(self) -> "dict[EpisodeId, QuerySessions]":
         return {}

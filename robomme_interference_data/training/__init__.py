@@ -16,14 +16,16 @@ if TYPE_CHECKING:
 
     from .history_dataset import HistoryDataset
     from .images import resize
+    from .sampler import HistorySampler
 
-__all__ = ["HistoryDataset", "Memory", "resize"]
+__all__ = ["HistoryDataset", "HistorySampler", "Memory", "resize"]
 
 __getattr__ = lazy_exports(
     __name__,
     {
         ".history_dataset": "HistoryDataset",
         ".images": "resize",
+        ".sampler": "HistorySampler",
         "robomme_interference_data.schema.sampling": "Memory",
     },
 )

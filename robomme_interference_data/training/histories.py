@@ -9,13 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import DEMONSTRATIONS
+from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.query_sessions import QuerySessions, SessionSource
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.retrieval.stored_selector import StoredSelector
 from robomme_interference_data.schema.conditions import parse_condition
+from robomme_interference_data.schema.manifest import SessionEntry
 from robomme_interference_data.schema.shifts import Shift
 
 from .draws import number_from
@@ -69,10 +70,21 @@ class Histories:
         )
         self.parts = max((span.part + 1 for span in spans), default=1)
 
-    @property
-    def longest(self) -> int:
-        """Most frames of a planned history."""
-        return max(len(history.rows) for history in self._known.values())
+    def longest(self, conditions: Sequence[str], episodes: Collection[EpisodeId]) -> int:
+        """Return the most frames of a history, planned or drawn in any epoch."""
+        if self._redraw is None:
+            return max(len(history.rows) for history in self._known.values())
+        source = SessionSource(self._set.datasets, 0, self._redraw[1])
+        return max(
+            sum(
+                session.num_frames
+                for session in parse_condition(name).sessions(
+                    _LongestSessions(source, self._set.query(episode).record)
+                )
+            )
+            for name in conditions
+            for episode in episodes
+        )
 
     @property
     def rows(self) -> NDArray[np.int64]:
@@ -136,3 +148,13 @@ class Histories:
             chosen = self._retrieval.select(self._set, buffer, shift)
             rows, evidence = rows[chosen], evidence if evidence is None else evidence[chosen]
         return DrawnHistory(rows, evidence)
+
+
+class _LongestSessions(QuerySessions):
+    """The sessions of a query, with the longest unit in the place of any that may be drawn."""
+
+    def units(self, k: int, dataset: str = DISTRACTORS) -> Sequence[SessionEntry]:
+        return [self._source.longest(dataset)] * k
+
+    def own_units(self, k: int) -> Sequence[SessionEntry]:
+        return self.units(k)

@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -10,27 +10,29 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, SHIFTED, STATE
+from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, SHIFTED, STATE
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import camera_feature
 from robomme_interference_data.data.loading import load_buffer_set, open_cache
 from robomme_interference_data.data.state_reader import other_state_sizes, query_state_size
 from robomme_interference_data.data.views import shifted_view
-from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.stored_selector import StoredSelector
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.schema.other_states import check_rule, check_sizes
-from robomme_interference_data.schema.sampling import Memory
+from robomme_interference_data.schema.sampling import Memory, spread
 from robomme_interference_data.schema.shifts import NO_SHIFT, Shift, parse_shift
 from robomme_interference_data.storage.text import digest_json
 
 from .batches import Batches, Drawn
 from .draws import Weights
+from .epoch import Epoch
 from .histories import Histories
 from .items import Items, item_of
+from .lerobot_layout import LeRobotMeta, LeRobotReads, describe, renamed, transform_images
 from .moments import check_arguments, check_size, choose_moments, drawable_rows, needed_datasets
 from .question_tensors import QuestionTensors
 from .reopening import reduced
@@ -40,7 +42,7 @@ if TYPE_CHECKING:
     from robomme_interference_data.storage.cache import DecodedCache
 
 
-class HistoryDataset:
+class HistoryDataset(LeRobotReads):
     """Moments of executions, with the memory that a policy has at that step of a rollout.
 
     Item `i` is moment t of an execution, the part of an episode after its lesson. Its history is
@@ -100,6 +102,11 @@ class HistoryDataset:
         seed: Seed of everything that is drawn.
         cache: Where decoded frames are kept: a `DecodedCache`, a folder for one of 20 GiB, or True
             for the folder `~/.cache/robomme-interference`.
+        layout: Names of an item's entries: `plain`, the above; or `lerobot`, below `observation.`
+            what a policy may see (`observation.memory.padding`, `observation.position`) and below
+            `label.` what it must not (`label.evidence`, `label.answer`, `label.condition`).
+        image_transforms: Random change of an item's images, from `(M + 1, 3, S, S) float32`, 0 to
+            1, to the same: those in memory and the current one, which it must change alike.
         quiet: Show no progress.
 
     Raises:
@@ -132,6 +139,8 @@ class HistoryDataset:
         other_states: str = "refuse",
         seed: int = 0,
         cache: "bool | str | os.PathLike[str] | DecodedCache" = True,
+        layout: str = "plain",
+        image_transforms: Callable[[torch.Tensor], torch.Tensor] | None = None,
         quiet: bool = False,
     ):
         for option, given in (("cameras", cameras), ("families", families)):
@@ -146,8 +155,10 @@ class HistoryDataset:
             chunk=chunk, split=split, families=tuple(families), episodes=episodes,
             retrieval=retrieval, retrieval_rule=retrieval_rule, retrieval_camera=retrieval_camera,
             shifts=shifts, questions=questions, redraw=redraw, unit_episodes=unit_episodes,
-            other_states=other_states, seed=seed, cache=cache,
+            other_states=other_states, seed=seed, cache=cache, layout=layout,
+            image_transforms=image_transforms,
         )  # fmt: skip
+        self.layout, self._image_transforms = layout, image_transforms
         self.memory, self.seed = Memory.parse(memory), seed
         self.chunk = whole_number("chunk", chunk, "an integer from 0", 0)
         self.cameras = tuple(camera_feature(camera) for camera in cameras)
@@ -198,7 +209,8 @@ class HistoryDataset:
                 )
             history = self._histories.rows
         # Here, not when they are first used: a loader's forked workers share what is open now.
-        self._rows.prepare((*self.cameras, STATE), np.concatenate([now, history]), quiet=quiet)
+        self._used = np.concatenate([now, history])
+        self._rows.prepare((*self.cameras, STATE), self._used, quiet=quiet)
         if actions:
             self._rows.prepare((ACTION,), now, quiet=quiet)
         self._batches = Batches(
@@ -210,8 +222,8 @@ class HistoryDataset:
             self.memory_frames,
             self._histories.parts,
         )
-        # Shared with the processes of a loader, which have copies of the dataset.
-        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()  # type: ignore[no-untyped-call]
+        several = len(self._conditions.names) > 1 or len(self._shifts.names) > 1
+        self._epoch = Epoch(len(self), draws=redraw or several)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return reduced(self, self._arguments)
@@ -236,7 +248,8 @@ class HistoryDataset:
         """Number M of places in memory, without the current frame."""
         if self.memory.rule != "full":
             return self.memory.frames - 1
-        return self._histories.longest + self._moments.most - 1
+        longest = self._histories.longest(self._conditions.names, self.episode_ids)
+        return longest + self._moments.most - 1
 
     @cached_property
     def content(self) -> str:
@@ -254,14 +267,66 @@ class HistoryDataset:
             ]
         )
 
+    def stored_values(self, feature: str, most: int | None = None) -> NDArray[Any]:
+        """Return the values of a feature in all sessions and executions in use, `(N, …)`.
+
+        Args:
+            feature: `action`, `observation.state` or `observation.images.<camera>`.
+            most: Most values, which are evenly spread; None for all.
+        """
+        used = self._moments.first if feature == ACTION else self._used
+        rows = self._rows.of_same_sessions(used)
+        return self._rows.take(feature, rows if most is None else rows[spread(0, len(rows), most)])
+
+    @cached_property
+    def meta(self) -> LeRobotMeta:
+        """What LeRobot's training reads beside the items, with actions, in the layout `lerobot`.
+
+        Raises:
+            InvalidOptionError: Items have no actions.
+        """
+        if not self.chunk:
+            raise InvalidOptionError.expected("chunk", 0, "1 or more: LeRobot trains on actions")
+        live = self.buffer_set.datasets[EXECUTIONS]
+        ends = self._moments.stops.tolist()
+        return describe(
+            self.buffer_set, live, self.episode_ids, ends, self.cameras, self.stored_values
+        )
+
     @property
     def epoch(self) -> int:
         """The epoch, from 0."""
-        return int(self._epoch)
+        return self._epoch.number
 
     def set_epoch(self, epoch: int) -> None:
-        """Set the epoch, on which all draws depend, in this process and in those of its loaders."""
-        self._epoch.fill_(whole_number("epoch", epoch, "an integer from 0", 0))
+        """Set the epoch, on which all draws depend, in this process and in those of its loaders.
+
+        A `HistorySampler` does so by itself.
+        """
+        self._epoch.set(whole_number("epoch", epoch, "an integer from 0", 0))
+
+    def values(self, name: str) -> NDArray[Any]:
+        """Return a value of each item's moment, such as to weight or leave out moments by it.
+
+        Args:
+            name: `action`, the first of the chunk, `observation.state`, `frame_index` or
+                `episode_id`.
+
+        Returns:
+            `(N, D) float32`, `(N,) int64` or `(N,)` texts.
+
+        Raises:
+            UnknownNameError: There is no such value; actions only if `chunk` is not 0.
+        """
+        numbers, moments = self._moments.of_items
+        known = ["observation.state", "frame_index", "episode_id", *[ACTION] * (self.chunk > 0)]
+        if name not in known:
+            raise UnknownNameError.among("value", name, "the items", known)
+        if name == "frame_index":
+            return moments
+        if name == "episode_id":
+            return np.array([str(episode) for episode in self.episode_ids])[numbers]
+        return self._rows.take(name, self._moments.first[numbers] + moments)
 
     def index_of(self, episode_id: EpisodeId | str, frame_index: int = 0) -> int:
         """Return the index of the item of an episode's moment.
@@ -281,6 +346,7 @@ class HistoryDataset:
 
         PyTorch's loaders call it.
         """
+        self._epoch.count(len(indices))
         return Items(self._batch(np.asarray(indices)))
 
     def _batch(self, indices: NDArray[np.integer]) -> dict[str, Any]:
@@ -301,7 +367,11 @@ class HistoryDataset:
         if self._questions is not None:
             arrays |= self._questions.arrays(numbers)
             texts |= self._questions.texts(numbers)
-        return {name: torch.from_numpy(values) for name, values in arrays.items()} | texts
+        batch = {name: torch.from_numpy(values) for name, values in arrays.items()} | texts
+        if self._image_transforms is not None:
+            keys = [(self.seed, self.epoch, drawn.item) for drawn in items]
+            transform_images(batch, self.cameras, self._image_transforms, keys)
+        return renamed(batch) if self.layout == "lerobot" else batch
 
     def _drawn(self, index: int) -> Drawn:
         if not -len(self) <= index < len(self):

@@ -37,7 +37,7 @@ def item_of(batch: dict[str, Any], place: int) -> dict[str, Any]:
     """Return an item of a batch."""
     return {
         name: [texts[place] for texts in values]
-        if name == "question.options"  # O lists of the texts of B options
+        if name.endswith("question.options")  # O lists of the texts of B options
         else values[place]
         for name, values in batch.items()
     }

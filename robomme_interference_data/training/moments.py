@@ -22,6 +22,7 @@ from robomme_interference_data.ids import EpisodeId, format_numbers, parse_numbe
 from robomme_interference_data.schema.conditions import datasets_of, parse_condition
 from robomme_interference_data.schema.shifts import NO_SHIFT
 
+from .lerobot_layout import LAYOUTS
 from .rows import StoredRows
 
 _NO_ACTIONS = "Items without actions (chunk=0) need no executions."
@@ -58,7 +59,9 @@ def check_size(buffer_set: BufferSet, cameras: Sequence[str], size: int | None) 
 
 
 def check_arguments(given: Mapping[str, Any], shifts: Sequence[str]) -> None:
-    """Check the arguments of a `HistoryDataset` against each other."""
+    """Check arguments of a `HistoryDataset`, and some against each other."""
+    if given["layout"] not in LAYOUTS:
+        raise InvalidOptionError.one_of("layout", given["layout"], LAYOUTS)
     for name, default, needed in (
         ("unit_episodes", None, "redraw"),
         ("retrieval_rule", "max", "retrieval"),
@@ -68,11 +71,6 @@ def check_arguments(given: Mapping[str, Any], shifts: Sequence[str]) -> None:
             raise InvalidOptionError(
                 f"{name} has no effect without {needed}", f"Set {needed}, or leave {name} out."
             )
-    if given["redraw"] and given["memory"] == "full":
-        raise InvalidOptionError(
-            "memory 'full' has no fixed size if sessions are drawn anew",
-            "Set a size, such as memory='window:512', or redraw=False.",
-        )
     if shifts != (NO_SHIFT,) and given["chunk"]:
         expected = "none with actions: only first live observations are stored under shifts"
         raise InvalidOptionError.expected("shifts", list(shifts), expected)
@@ -102,6 +100,13 @@ class Moments:
     def most(self) -> int:
         """Most moments of an episode."""
         return int(np.diff(self.stops, prepend=0).max())
+
+    @property
+    def of_items(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Number of the episode of each item, and its moment, `(N,)` each."""
+        counts = np.diff(self.stops, prepend=0)
+        numbers = np.repeat(np.arange(len(counts)), counts)
+        return numbers, np.arange(len(self)) - (self.stops - counts)[numbers]
 
     def locate(self, index: int) -> tuple[int, int]:
         """Return the number of the episode of an item, and the moment."""

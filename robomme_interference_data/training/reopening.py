@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 from robomme_interference_data.errors import HashMismatchError, InterferenceError
 from robomme_interference_data.storage.files import LocalFiles
 
-if TYPE_CHECKING:
-    import torch
+from .epoch import Epoch
 
+if TYPE_CHECKING:
     from .history_dataset import HistoryDataset
 
 
@@ -41,7 +41,7 @@ def reduced(data: "HistoryDataset", arguments: dict[str, Any]) -> tuple[Any, ...
 
 
 def open_again(
-    location: str, arguments: dict[str, Any], epoch: "torch.Tensor", content: str
+    location: str, arguments: dict[str, Any], epoch: Epoch, content: str
 ) -> "HistoryDataset | Unusable":
     """Return a dataset in another process, with the same items."""
     from .history_dataset import HistoryDataset

@@ -111,6 +111,13 @@ class StoredRows:
                 pool.shutdown(cancel_futures=True)
                 raise
 
+    def of_same_sessions(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return all rows, in order, of the sessions and executions that some rows belong to."""
+        spans = [self._spans[number] for number in np.unique(self._owner(rows)).tolist()]
+        first = [self.first(span.dataset, span.episode) for span in spans]
+        ranges = [np.arange(span.start, span.stop) for span in spans]
+        return np.concatenate([a + b for a, b in zip(first, ranges, strict=True)])
+
     def take(self, feature: str, rows: NDArray[np.int64]) -> NDArray[Any]:
         """Return the values of rows, `(*rows.shape, …)`; 0 for `PADDING`.
 

@@ -34,13 +34,13 @@ from robomme_interference_data.build_dataset.dataset.staged import (
     read_staged,
     staged_name,
 )
-from robomme_interference_data.build_dataset.dataset.statistics import ImageStats
 from robomme_interference_data.build_dataset.sources import Frame
 from robomme_interference_data.constants import DISTRACTORS
 from robomme_interference_data.errors import BuildError, SourceError
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.schema.records import EvidenceSpan, SpanDigests
 from robomme_interference_data.storage.arrays import combine
+from robomme_interference_data.storage.lerobot.statistics import ImageStats
 from robomme_interference_data.storage.video.encode import CODECS, VideoEncoder
 from robomme_interference_data.storage.video.frames import iter_frames
 

@@ -18,13 +18,13 @@ from robomme_interference_data import load_buffer
 from robomme_interference_data.build_dataset.dataset.build import build_dataset
 from robomme_interference_data.build_dataset.dataset.frame_checks import check_shapes
 from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
-from robomme_interference_data.build_dataset.dataset.statistics import vector_statistics
 from robomme_interference_data.build_dataset.plan.episodes import choose_episodes
 from robomme_interference_data.build_dataset.sources import Frame, Recording, Robot, SourceEpisode
 from robomme_interference_data.constants import ACTION, CAMERA_PREFIX, STATE, Unit
 from robomme_interference_data.errors import SourceError
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Serial
+from robomme_interference_data.storage.lerobot.statistics import vector_statistics
 from robomme_interference_data.storage.limits import MAX_VECTOR
 from robomme_interference_data.storage.parquet import RowSpan
 

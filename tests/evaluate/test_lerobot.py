@@ -22,7 +22,7 @@ from robomme_interference_data.evaluate.policies.policy import RolloutInfo
 from robomme_interference_data.evaluate.policies.registry import POLICIES, make_policy
 
 torch, _ = lazy("torch"), lazy("lerobot")
-lerobot = lazy("robomme_interference_data.evaluate.policies.lerobot")
+lerobot = lazy("robomme_interference_data.evaluate.policies.lerobot.policy")
 small = lazy("support.lerobot_policies")
 pytestmark = pytest.mark.filterwarnings("ignore:To evaluate in the environment, your VQ-BeT")
 
@@ -231,7 +231,7 @@ def rename(config: dict[str, Any]) -> None:
             "gives actions {'action': (7,)}; the simulators take action (8,)",
         ),
         (lambda config: config.update(use_peft=True), "is an adapter (PEFT)"),
-        (lambda config: config.update(type="nonesuch"), "Policy type 'nonesuch'"),
+        (lambda config: config.update(type="nonesuch"), "has the type 'nonesuch'"),
         (lambda config: config.update(chunk_size=1), "LeRobot cannot load the policy"),
     ],
 )
@@ -313,6 +313,24 @@ def test_a_model_of_the_hub_is_identified_by_its_commit(
     policy = make_policy(f"lerobot:me/act@{commit}", ["device=cpu"])
     assert policy.metadata()["source"] == f"me/act@{commit}"
     assert POLICIES.pin(f"lerobot:{act}") == f"lerobot:{act}"
+
+
+def test_a_checkpoint_reports_its_training(act: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(act, tmp_path / "000100" / "pretrained_model")
+    facts = ("training_seed", "training_steps", "training_step")
+
+    def reported() -> dict[str, int]:
+        metadata = made(folder).metadata()
+        return {name: metadata[name] for name in facts if name in metadata}
+
+    assert reported() == {}
+    # As `save_checkpoint` of LeRobot writes them.
+    (folder / "train_config.json").write_text(json.dumps({"steps": 200, "seed": 1000}))
+    assert reported() == {"training_seed": 1000, "training_steps": 200}
+    state = folder.parent / "training_state"
+    state.mkdir()
+    (state / "training_step.json").write_text(json.dumps({"step": 100}))
+    assert reported() == {"training_seed": 1000, "training_steps": 200, "training_step": 100}
 
 
 def test_a_folder_is_identified_by_weights_and_configuration(act: Path, tmp_path: Path) -> None:

@@ -10,9 +10,11 @@ import numpy as np
 import torch
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
+from lerobot.utils.import_utils import register_third_party_plugins
 
 from robomme_interference_data.constants import ACTION, FRONT, STATE, WRIST
 from robomme_interference_data.evaluate.policies.policy import RolloutInfo
+from robomme_interference_data.schema.memory_features import in_memory
 from robomme_interference_data.simulators.episode import Observation
 
 SIZE = 256
@@ -33,15 +35,26 @@ SMALL: dict[str, dict[str, Any]] = {
         **{"n_obs_steps": 2, "horizon": 16, "n_action_steps": 8, "down_dims": (16, 32)},
         **{"num_inference_steps": 2, "crop_shape": (64, 64), "spatial_softmax_num_keypoints": 4},
     },
+    "history_act": {
+        **{"memory": "framesamp:4", "image_size": 24, "dim_model": 32, "n_heads": 2},
+        **{"dim_feedforward": 32, "n_encoder_layers": 1, "use_vae": False},
+    },
 }
 
 
-def features(cameras: tuple[str, ...] = (FRONT, WRIST)) -> dict[str, Any]:
-    images = {name: PolicyFeature(FeatureType.VISUAL, (3, SIZE, SIZE)) for name in cameras}
+def features(cameras: tuple[str, ...] = (FRONT, WRIST), size: int = SIZE) -> dict[str, Any]:
+    images = {name: PolicyFeature(FeatureType.VISUAL, (3, size, size)) for name in cameras}
     return {
         "input_features": images | {STATE: PolicyFeature(FeatureType.STATE, (8,))},
         "output_features": {ACTION: PolicyFeature(FeatureType.ACTION, (8,))},
     }
+
+
+def features_with_memory(cameras: tuple[str, ...], size: int) -> dict[str, Any]:
+    """Features as a policy gets them from a dataset with a memory."""
+    made = features(cameras, size)
+    now = made["input_features"]
+    return made | {"input_features": now | {in_memory(name): now[name] for name in now}}
 
 
 def stats(cameras: tuple[str, ...]) -> dict[str, dict[str, torch.Tensor]]:
@@ -50,7 +63,8 @@ def stats(cameras: tuple[str, ...]) -> dict[str, dict[str, torch.Tensor]]:
     vector = {"mean": numbers / 8, "std": numbers + 1, "min": -numbers - 1, "max": numbers + 2}
     values = {"mean": 0.4, "std": 0.2, "min": 0.0, "max": 1.0}
     image = {name: torch.full((3, 1, 1), value) for name, value in values.items()}
-    return {STATE: vector, ACTION: vector, **dict.fromkeys(cameras, image)}
+    now = {STATE: vector, **dict.fromkeys(cameras, image)}
+    return now | {in_memory(name): values for name, values in now.items()} | {ACTION: vector}
 
 
 def save_policy(
@@ -58,7 +72,13 @@ def save_policy(
 ) -> Path:
     """Save a policy as LeRobot's training does; what is drawn at random is always the same."""
     given = {"device": "cpu", "push_to_hub": False, "pretrained_backbone_weights": None}
-    config = make_policy_config(kind, **(features(cameras) | given | SMALL[kind] | options))
+    own = SMALL[kind] | options
+    if "memory" in own:
+        register_third_party_plugins()
+        fits = features_with_memory(cameras, own["image_size"])
+    else:
+        fits = features(cameras)
+    config = make_policy_config(kind, **(fits | given | own))
     with torch.random.fork_rng([]):
         torch.manual_seed(1)
         policy = get_policy_class(kind)(config)

@@ -162,7 +162,7 @@ def test_no_process_outlives_the_command(tmp_path: Path, sent: signal.Signals) -
 
 @pytest.mark.slow
 def test_a_shared_act_returns_the_same_bits(tmp_path: Path) -> None:
-    lerobot = pytest.importorskip("robomme_interference_data.evaluate.policies.lerobot")
+    lerobot = pytest.importorskip("robomme_interference_data.evaluate.policies.lerobot.policy")
     for kind in ("act", "vqbet"):
         folder = small.save_policy(
             tmp_path / kind, kind, *(() if kind == "act" else [("observation.images.front",)])

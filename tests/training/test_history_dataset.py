@@ -223,6 +223,17 @@ def test_a_batch_of_questions_and_shifts(make: Make, tmp_path: Path) -> None:
         same(data[every], default_collate([data[index] for index in every]))
 
 
+def test_values_of_all_moments(make: Make) -> None:
+    data = make(["k0"])
+    batch = data[[0, LIVE, 3 * LIVE - 1]]
+    assert data.values("action").shape == (3 * LIVE, 8)
+    for name in ("observation.state", "frame_index", "episode_id"):
+        np.testing.assert_array_equal(data.values(name)[[0, LIVE, -1]], np.asarray(batch[name]))
+    np.testing.assert_array_equal(data.values("action")[[0, LIVE, -1]], batch["action"][:, 0])
+    with raises(UnknownNameError):
+        make(["k0"], chunk=0).values("action")
+
+
 # --- what it refuses ---------------------------------------------------------------------------
 
 
@@ -251,7 +262,6 @@ def test_a_batch_of_questions_and_shifts(make: Make, tmp_path: Path) -> None:
         ({"shifts": {"light:1": 1}}, InvalidOptionError),
         ({"questions": True}, MissingFileError),
         ({"conditions": ["raw-k1"], "redraw": True}, MissingFileError),
-        ({"memory": "full", "redraw": True}, InvalidOptionError),
         ({"cache": False}, InvalidOptionError),
     ],
 )

@@ -67,6 +67,15 @@ def test_weights_are_probabilities(weights: list[int], seed: int) -> None:
         assert abs(counts[name] / 2000 - share) < 6 * (share * (1 - share) / 2000) ** 0.5 + 1e-9
 
 
+def test_a_redrawn_memory_has_places_for_the_longest_history(make: Make) -> None:
+    """A lesson of 48 frames and up to five units of 32, before the current frame."""
+    data = make({"k5": 1, "before-k2": 1}, redraw=True, chunk=0, memory="full")
+    assert data.memory_frames == 48 + 5 * 32
+    for item in (data[index] for index in range(3)):
+        used = 48 + 32 * {"k5": 5, "before-k2": 2}[item["condition"]]
+        assert int(item["position"]) == used == int((~item["memory.is_pad"]).sum())
+
+
 def test_sessions_drawn_anew_keep_the_rules(make: Make, buffers: Path) -> None:
     """Conditions need not be planned; units are of other families and of the allowed episodes."""
     data = make(["k5"], redraw=True, unit_episodes="0", chunk=0, memory="window:400")

@@ -4,56 +4,35 @@ The configuration is checked when the policy is made; weights are loaded at the 
 """
 
 import copy
-import sys
-from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
-from pathlib import Path
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 import torch
-from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
-from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.policies.factory import get_policy_class
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import (
-    ACTION,
-    ACTION_CHUNK,
-    CAMERA_PREFIX,
-    FRONT,
-    STATE,
-    WRIST,
-)
-from robomme_interference_data.errors import MissingExtraError, MissingFileError, PolicyError
+from robomme_interference_data.constants import ACTION, ACTION_CHUNK, CAMERA_PREFIX, FRONT, WRIST
+from robomme_interference_data.evaluate.policies.policy import BatchPolicy, Frames, RolloutInfo
 from robomme_interference_data.runtime.device import choose_device
 from robomme_interference_data.schema.other_states import check_rule
 from robomme_interference_data.simulators.episode import ACTION_SIZE, Observation
-from robomme_interference_data.storage.hub import locate
 from robomme_interference_data.storage.weights import digest_weights
 
-from .policy import BatchPolicy, Frames, RolloutInfo
-
-_IMAGE_SHAPE = (3, 256, 256)
-"""Shape of an image of the simulators, channels first."""
-
-_FILES = ("*.json", "*.safetensors", "*.model")
-"""What a policy is loaded from: configuration, weights, tokenizers."""
-
-_NEEDED = (
-    "config.json",
-    "model.safetensors",
-    "policy_preprocessor.json",
-    "policy_postprocessor.json",
-)
+from .checks import check_features, check_statistics, declared_memory, feature_names
+from .files import POLICY_FILES, explained, find_policy, make_processors, read_config, read_training
+from .observations import LastObservations, Observations, ObservationWithMemory
 
 
 class LeRobotPolicy(BatchPolicy):
     """A policy trained with LeRobot, such as one of its ACT, diffusion or VLA models.
 
-    A policy that acts on one observation uses no history and runs under `no-history` only. One that
-    acts on the last few (`n_obs_steps` above 1, such as diffusion policies) gets them in its own
-    queue: first the end of the history, then live observations.
+    A policy whose configuration declares a memory (`memory` and `image_size`) gets, with each
+    observation, what that rule keeps of the history and of live frames, as `observation.memory.*`.
+    Of the others, one that acts on one observation uses no history and runs under `no-history`
+    only. One that acts on the last few (`n_obs_steps` above 1, such as diffusion policies) gets
+    them in its own queue: first the end of the history, then live observations.
 
     Sessions of a policy act in one forward pass, unless it keeps such a queue, averages over chunks
     (temporal ensembling) or draws random numbers: then they act one after the other.
@@ -70,70 +49,65 @@ class LeRobotPolicy(BatchPolicy):
         self.other_states = check_rule(other_states)
         self._device = str(choose_device(device))
         self._folder, self._source = find_policy(path)
-        with _explained(path):
-            self._config = PreTrainedConfig.from_pretrained(self._folder)
-            self._config.device = self._device
-            self._config.pretrained_path = self._folder
+        self._config = read_config(path, self._folder, self._device)
+        self._memory = declared_memory(path, self._config)
+        with explained(path):
             self._before, self._after = self._make_processors()
-        names = _feature_names(self._before)
-        _check_features(path, self._config, names)
-        _check_statistics(path, (*self._before.steps, *self._after.steps))
-        wanted = [name for name in (FRONT, WRIST) if names[name] in self._config.input_features]
+        check_features(path, self._config, self._before, self._memory)
+        check_statistics(path, (*self._before.steps, *self._after.steps))
+        names = feature_names(self._before, (FRONT, WRIST))
+        wanted = [name for name in names if names[name] in self._config.input_features]
         self.cameras = tuple(name.removeprefix(CAMERA_PREFIX) for name in wanted)
         self._steps = int(self._config.n_obs_steps or 1)
-        self.wants_history = self.every_frame = self._steps > 1
+        self.memory = None if self._memory is None else str(self._memory)
+        self.wants_history = self.every_frame = self._memory is not None or self._steps > 1
         self.history_cameras = self.cameras if self.wants_history else ()
+        self._observations = self._make_observations()
         self._model: Any = None
-        self._recent: deque[dict[str, Any]] = deque(maxlen=self._steps)
         self._seed = self._asked = 0
         self._draws = False  # whether it is known to draw random numbers
 
-    def _make_processors(self) -> Any:
-        return make_pre_post_processors(
-            self._config,
-            pretrained_path=str(self._folder),
-            preprocessor_overrides={"device_processor": {"device": self._device}},
-        )
+    def _make_processors(self) -> tuple[Any, Any]:
+        return make_processors(self._config, self._folder, self._device)
+
+    def _make_observations(self) -> Observations:
+        if self._memory is None:
+            return LastObservations(self.cameras, self._steps)
+        return ObservationWithMemory(self.cameras, self._memory, self._config.image_size)
 
     def _load(self) -> None:
         if self._model is None:
-            with _explained(str(self._folder)):
+            with explained(str(self._folder)):
                 kind = get_policy_class(self._config.type)
                 self._model = kind.from_pretrained(self._folder, config=self._config, strict=True)
 
     def session(self) -> "LeRobotPolicy":
-        """Return a policy with its own queues and processors, loading the weights if necessary."""
+        """Return a policy with its own memory and processors, loading the weights if necessary."""
         self._load()
         session = copy.copy(self)
         session._before, session._after = self._make_processors()
-        session._recent = deque(maxlen=self._steps)
+        session._observations = self._make_observations()
         # A copy of all that the model keeps between calls, whatever its type, but not of tensors.
         weights = (*self._model.parameters(), *self._model.buffers())
         session._model = copy.deepcopy(self._model, {id(tensor): tensor for tensor in weights})
         return session
 
     def reset(self, info: RolloutInfo) -> None:
-        """Empty the policy's queues, loading its weights first if necessary."""
+        """Empty memory and queues, loading its weights first if necessary."""
         self._load()
         self._model.reset()
         self._before.reset()
         self._after.reset()
-        self._recent.clear()
+        self._observations.clear()
         self._seed, self._asked = info.seed, 0
 
     def add_history(self, frames: Frames, states: NDArray[np.float32], exec_start_idx: int) -> None:
-        """Keep the last few frames."""
-        self.observe(frames, states)
+        """Keep frames of the history."""
+        self._observations.add(frames, states)
 
     def observe(self, frames: Frames, states: NDArray[np.float32]) -> None:
-        """Keep the last few frames as LeRobot's processors take them: images from 0 to 1."""
-        for index in range(max(0, len(states) - self._steps), len(states)):
-            state = torch.from_numpy(np.array(states[index], np.float32))
-            seen: dict[str, Any] = {STATE: state[None]}
-            for camera in self.cameras:
-                pixels = torch.from_numpy(frames[camera][index].copy()).permute(2, 0, 1)
-                seen[CAMERA_PREFIX + camera] = (pixels.to(torch.float32) / 255).contiguous()[None]
-            self._recent.append(seen)
+        """Keep live frames."""
+        self._observations.add(frames, states)
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return a chunk of actions, `(n, 8) float32`, n at most 16."""
@@ -141,7 +115,7 @@ class LeRobotPolicy(BatchPolicy):
         with torch.inference_mode(), self._seeded():
             chunk = self._ask(earlier, last) if self._has_queue else self._predict(last)
             actions = self._finished(chunk)
-        self._recent.clear()
+        self._observations.acted()
         return actions
 
     def act_batch(
@@ -161,7 +135,7 @@ class LeRobotPolicy(BatchPolicy):
                     parts = zip(sessions, chunks.unbind(), strict=True)
                     actions = [session._finished([*chunk[:, None]]) for session, chunk in parts]
                     for session in sessions:
-                        session._recent.clear()
+                        session._observations.acted()
                     return actions
         # Each session has its own seed, which a batch could not follow.
         return [
@@ -171,7 +145,7 @@ class LeRobotPolicy(BatchPolicy):
 
     def _processed(self, goal: str) -> list[dict[str, Any]]:
         """Return the last observations as the model takes them."""
-        return [self._before(seen | {"task": [goal]}) for seen in self._recent]
+        return [self._before(seen | {"task": [goal]}) for seen in self._observations.current()]
 
     def _finished(self, chunk: list[torch.Tensor]) -> NDArray[np.float32]:
         """Return the executed part of a chunk, `(n, 8)`, in the units of actions."""
@@ -234,13 +208,14 @@ class LeRobotPolicy(BatchPolicy):
             yield
 
     def metadata(self) -> dict[str, Any]:
-        """Return the source, the SHA-256 of its files, and the device."""
+        """Return the source, the SHA-256 of its files, its training, and the device."""
         return {
             "policy": "lerobot",
             "source": self._source,
-            "sha256": digest_weights(self._folder, _FILES),
+            "sha256": digest_weights(self._folder, POLICY_FILES),
             "type": self._config.type,
             "n_obs_steps": self._steps,
+            **read_training(self._folder),
             "device": self._device,
         }
 
@@ -268,94 +243,3 @@ def _stacked(items: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
         else:
             batch[name] = first
     return batch
-
-
-def find_policy(path: str) -> tuple[Path, str]:
-    """Return the folder with a policy's files, and its source, on the Hub with the commit."""
-    files = locate(path, "model")
-    folder, name = files.snapshot(*_FILES), files.location
-    missing = [name for name in _NEEDED if not (folder / name).is_file()]
-    if missing:
-        raise MissingFileError(
-            f"{', '.join(missing)} missing in {name}",
-            "Expected a folder of LeRobot 0.6, such as …/checkpoints/last/pretrained_model.",
-        )
-    return folder, name
-
-
-@contextmanager
-def _explained(path: str) -> Iterator[None]:
-    """Convert exceptions of LeRobot while loading into errors of this package."""
-    try:
-        with redirect_stdout(sys.stderr):  # it prints
-            yield
-    except ImportError as error:
-        raise MissingExtraError(
-            f"the policy {path} needs more of LeRobot: {error}", "Install what it names."
-        ) from error
-    except Exception as error:
-        raise PolicyError(
-            f"LeRobot cannot load the policy {path}: {type(error).__name__}: {error}",
-            "Was it saved by lerobot 0.6? Older ones are migrated with "
-            "python -m lerobot.processor.migrate_policy_normalization.",
-        ) from error
-
-
-def _feature_names(before: Any) -> dict[str, str]:
-    """Return the name under which each observation reaches the policy."""
-    names = {name: name for name in (FRONT, WRIST, STATE)}
-    for step in before.steps:
-        renames = getattr(step, "rename_map", None) or {}
-        names = {name: renames.get(known, known) for name, known in names.items()}
-    return names
-
-
-def _check_statistics(path: str, steps: Iterable[Any]) -> None:
-    """Check that states and actions have the statistics by which they are normalized.
-
-    LeRobot passes values without statistics on unchanged: the robot would carry out the model's own
-    numbers.
-    """
-    for step in steps:
-        modes = getattr(step, "norm_map", {})
-        for name, feature in getattr(step, "features", {}).items():
-            mode = modes.get(feature.type, NormalizationMode.IDENTITY)
-            vector = feature.type in (FeatureType.STATE, FeatureType.ACTION)
-            if vector and mode is not NormalizationMode.IDENTITY and not step.stats.get(name):
-                raise PolicyError(
-                    f"the policy {path} normalizes {name} ({mode.value}), but has no statistics "
-                    "for it",
-                    "Save it with the processors of its training: make_pre_post_processors(config, "
-                    "dataset_stats=dataset.meta.stats).",
-                )
-
-
-def _check_features(path: str, config: Any, names: dict[str, str]) -> None:
-    """Compare the policy's features with the simulators' observations and actions."""
-    provided = {
-        names[FRONT]: _IMAGE_SHAPE,
-        names[WRIST]: _IMAGE_SHAPE,
-        names[STATE]: (ACTION_SIZE,),
-    }
-    wrong = []
-    for name, feature in (config.input_features or {}).items():
-        shape = tuple(feature.shape)
-        if name not in provided:
-            wrong.append(f"wants {name} {shape}, which the simulators do not provide")
-        elif shape != provided[name]:
-            wrong.append(f"wants {name} of shape {shape}; the simulators provide {provided[name]}")
-    actions = {
-        name: tuple(feature.shape)
-        for name, feature in (config.output_features or {}).items()
-        if feature.type is FeatureType.ACTION
-    }
-    if actions != {ACTION: (ACTION_SIZE,)}:
-        wrong.append(f"gives actions {actions}; the simulators take {ACTION} ({ACTION_SIZE},)")
-    if config.use_peft:
-        wrong.append("is an adapter (PEFT), which must be merged into its model first")
-    if wrong:
-        raise PolicyError(
-            f"the policy {path} does not fit: it {'; it '.join(wrong)}",
-            f"Train it on {FRONT}, {WRIST}, {STATE} and {ACTION} of a buffer set's executions; "
-            "see docs/how-to/connect-a-policy.md.",
-        )
