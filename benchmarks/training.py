@@ -1,9 +1,10 @@
 """How many items a processor second gives for training, and how flat memory stays.
 
 An item has 32 frames of the front camera, sampled evenly from a k7 buffer and the first live view.
-Batches of 64 from HistoryDataset are compared with its single items, collated; with a copy of the
-images in a batch's memory; with Buffer.stream of the same frames; and with LeRobotDataset, whose
-delta_timestamps take 32 frames from one episode, the lesson.
+Batches of 64 from HistoryDataset are compared with those of a loader; with its single items,
+collated; with a copy of the images in a batch's memory; with Buffer.stream of the same frames; and
+with LeRobotDataset in its default settings, as uint8, whose delta_timestamps take 32 frames from
+one episode, the lesson: evenly spread, or one after the other.
 """
 
 import argparse
@@ -25,7 +26,7 @@ from common import (
     print_table,
     run,
 )
-from torch.utils.data import default_collate
+from torch.utils.data import DataLoader, default_collate
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.constants import DEMONSTRATIONS, FPS, FRONT
@@ -48,6 +49,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as cache:
         buffer_set = load_buffer_set(root)
         options = {"chunk": 0, "cache": cache, "quiet": True}
+        # The buffer set of the demonstration has test episodes.
+        options |= {"split": buffer_set.episode_ids[0].split}
         data = HistoryDataset(buffer_set, ["k7"], image_size=args.image_size, **options)
         large = HistoryDataset(buffer_set, ["k7"], **options)
         count = len(data)
@@ -61,6 +64,10 @@ def main() -> None:
 
         def collated(number: int) -> object:
             return default_collate([data[index] for index in many[number]])
+
+        def loaded(number: int) -> object:
+            [batch] = DataLoader(data, BATCH, sampler=many[number])
+            return batch
 
         def copying(of: HistoryDataset, indices: list[list[int]]) -> Callable[[int], object]:
             images = of[indices[0]]["memory.images.front"].numpy()
@@ -78,12 +85,14 @@ def main() -> None:
         # Calls a round, items a call, what is called, and what it is compared with.
         ways: dict[str, tuple[int, int, Callable[[int], object], str]] = {
             small: (8, BATCH, batches(data, many), small),
+            f"the same in a DataLoader, {args.image_size} px": (8, BATCH, loaded, small),
             f"items and default_collate, {args.image_size} px": (8, BATCH, collated, small),
             f"copy of the same bytes, {args.image_size} px": (8, BATCH, copying(data, many), small),
             full: (8, FEW, batches(large, few), full),
             f"copy of the same bytes, {side} px": (8, FEW, copying(large, few), full),
             f"Buffer.stream(indices=…), {side} px": (min(4, count), 1, stream, full),
-            f"LeRobotDataset, delta_timestamps, {side} px": (4, 1, lerobot(Path(root)), full),
+            f"LeRobotDataset, 32 spread frames, {side} px": (4, 1, lerobot(root, 31), full),
+            f"LeRobotDataset, 32 frames in a row, {side} px": (4, 1, lerobot(root, None), full),
         }
 
         def epochs(number: int) -> int:
@@ -106,19 +115,18 @@ def main() -> None:
     print(f"\nFour more epochs add {megabytes(grown)} MB to the peak memory.")
 
 
-def lerobot(root: Path) -> Callable[[int], object]:
-    """Return how LeRobot gives 32 frames of a lesson, evenly spread, as one item."""
+def lerobot(root: Path, parts: int | None) -> Callable[[int], object]:
+    """Return how LeRobot gives 32 frames of a lesson as one item: spread evenly, or in a row."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    folder = root / DEMONSTRATIONS
-    plain = LeRobotDataset("local/it", root=folder, video_backend="pyav")
-    length = int(plain.meta.episodes[0]["length"])
-    steps = sorted({step * (length - 1) // 31 for step in range(32)})
-    offsets = {FRONT: [(step - length + 1) / FPS for step in steps]}
-    dataset = LeRobotDataset(
-        "local/it", root=folder, delta_timestamps=offsets, video_backend="pyav"
-    )
-    return lambda number: dataset[length - 1]
+    folder = Path(root) / DEMONSTRATIONS
+    plain = LeRobotDataset("local/it", root=folder)
+    last = int(plain.meta.episodes[0]["length"]) - 1
+    frames = range(last - 31, last + 1)
+    chosen = frames if parts is None else [step * last // parts for step in range(parts + 1)]
+    offsets = {FRONT: [(frame - last) / FPS for frame in chosen]}
+    dataset = LeRobotDataset("local/it", root=folder, delta_timestamps=offsets, return_uint8=True)
+    return lambda number: dataset[last]
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ import torch
 from command_line import default_device, device, names, number, run, weights, whole
 from memory_model import Config, MemoryModel, on_device, save_checkpoint
 from torch.nn import functional
-from torch.utils.data import BatchSampler, DataLoader
+from torch.utils.data import DataLoader
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.constants import CAMERA_PREFIX
@@ -166,11 +166,7 @@ def batches(data: HistoryDataset, args: argparse.Namespace, step: int) -> Iterat
         rest = order[done * args.batch : per_epoch * args.batch].tolist()
         # With its own generator, the loader does not change what dropout draws.
         loader = DataLoader(
-            data,
-            batch_size=None,  # the sampler makes the batches, and the dataset takes them whole
-            sampler=BatchSampler(rest, args.batch, drop_last=False),
-            num_workers=args.workers,
-            generator=generator,
+            data, args.batch, sampler=rest, num_workers=args.workers, generator=generator
         )
         for batch in loader:
             if step == args.steps:

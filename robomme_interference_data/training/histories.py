@@ -154,7 +154,8 @@ class _LongestSessions(QuerySessions):
     """The sessions of a query, with the longest unit in the place of any that may be drawn."""
 
     def units(self, k: int, dataset: str = DISTRACTORS) -> Sequence[SessionEntry]:
-        return [self._source.longest(dataset)] * k
+        longest = self._source.longest(dataset)
+        return [longest for _ in range(k)]
 
     def own_units(self, k: int) -> Sequence[SessionEntry]:
         return self.units(k)

@@ -319,7 +319,9 @@ class HistoryDataset(LeRobotReads):
             UnknownNameError: There is no such value; actions only if `chunk` is not 0.
         """
         numbers, moments = self._moments.of_items
-        known = ["observation.state", "frame_index", "episode_id", *[ACTION] * (self.chunk > 0)]
+        known = ["observation.state", "frame_index", "episode_id"]
+        if self.chunk:
+            known.append(ACTION)
         if name not in known:
             raise UnknownNameError.among("value", name, "the items", known)
         if name == "frame_index":

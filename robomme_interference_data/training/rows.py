@@ -6,7 +6,7 @@ of one session are read together, from one file of the cache of decoded frames.
 
 import os
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -38,6 +38,13 @@ class _Span(NamedTuple):
     stop: int
 
 
+class _Vectors(NamedTuple):
+    """Vectors of all rows, `(R + 1, D) float32`, and of which spans they are read."""
+
+    values: NDArray[np.float32]
+    known: NDArray[np.bool_]
+
+
 class StoredRows:
     """The stored values of several datasets, by row; opened, and stored, when first used.
 
@@ -60,20 +67,21 @@ class StoredRows:
         self._other_states = other_states
         self._first: dict[str, list[int]] = {}
         self._spans: list[_Span] = []
-        starts, total = [], 0
+        starts, self._total = [], 0
         for name, dataset in self._datasets.items():
             self._first[name] = []
             for record in dataset.records():
-                self._first[name].append(total)
+                self._first[name].append(self._total)
                 stop = record.session[1]
                 for span in ((0, stop), (stop, record.length)):
                     if span[0] < span[1]:
                         self._spans.append(_Span(name, record.episode_index, *span))
-                        starts.append(total + span[0])
-                total += record.length
+                        starts.append(self._total + span[0])
+                self._total += record.length
         self._starts = np.array(starts)
-        self._values: defaultdict[str, list[NDArray[Any] | None]]
-        self._values = defaultdict(lambda: [None] * len(self._spans))
+        self._frames: defaultdict[str, list[NDArray[np.uint8] | None]]
+        self._frames = defaultdict(lambda: [None] * len(self._spans))
+        self._vectors: dict[str, _Vectors] = {}
 
     def first(self, dataset: str, episode: int) -> int:
         """Return the row of an episode's first frame."""
@@ -103,7 +111,11 @@ class StoredRows:
             try:
                 for feature in features:
                     progress.start(feature.rpartition(".")[2], len(used))
-                    opening = [pool.submit(self._open, feature, number) for number in used]
+                    open_span: Callable[[str, int], object] = self._open
+                    if not _is_camera(feature):
+                        self._table(feature, np.array(used))
+                        open_span = self._read
+                    opening = [pool.submit(open_span, feature, number) for number in used]
                     for opened in as_completed(opening):
                         opened.result()
                         progress.advance(1)
@@ -123,34 +135,58 @@ class StoredRows:
 
         Images are `(3, H, W) uint8`, vectors `(D,) float32`.
         """
+        if not _is_camera(feature):
+            return self._vectors_of(feature, rows)
         flat = rows.ravel()
         owner = self._owner(flat)
+        local = flat - self._starts[owner]
         # Run by run of rows of the same span; PADDING belongs to none, number -1.
         bounds = [*np.diff(owner, prepend=len(self._spans)).nonzero()[0].tolist(), len(flat)]
-        numbers = owner[bounds[:-1]].tolist()
+        numbers, opened = owner[bounds[:-1]].tolist(), self._frames[feature]
         shape = self._shape(self._datasets[self._spans[max(numbers)].dataset], feature)
-        out = np.empty((len(flat), *shape), np.uint8 if _is_camera(feature) else np.float32)
+        out = np.empty((len(flat), *shape), np.uint8)
         for number, (start, stop) in zip(numbers, pairwise(bounds), strict=True):
             if number < 0:
                 out[start:stop] = 0
                 continue
-            local = flat[start:stop] - self._starts[number]
+            frames = opened[number]
+            if frames is None:
+                frames = self._open(feature, number)
             # The mode lets numpy write into `out` without a copy in between.
-            self._open(feature, number).take(local, axis=0, out=out[start:stop], mode="clip")
-        return out.reshape(*rows.shape, *out.shape[1:])
+            frames.take(local[start:stop], axis=0, out=out[start:stop], mode="clip")
+        return out.reshape(*rows.shape, *shape)
+
+    def _vectors_of(self, feature: str, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return the vectors of rows; they are few bytes, so all that are used are in memory."""
+        numbers = np.unique(self._owner(rows))
+        numbers = numbers[numbers >= 0]
+        vectors = self._table(feature, numbers)
+        for number in numbers[~vectors.known[numbers]].tolist():
+            self._read(feature, number)
+        return vectors.values[rows]  # the last one, that of PADDING, is 0
+
+    def _table(self, feature: str, numbers: NDArray[np.int64]) -> "_Vectors":
+        if feature not in self._vectors:
+            dataset = self._datasets[self._spans[int(numbers.max(initial=0))].dataset]
+            values = np.zeros((self._total + 1, *self._shape(dataset, feature)), np.float32)
+            self._vectors[feature] = _Vectors(values, np.zeros(len(self._spans), bool))
+        return self._vectors[feature]
 
     def _owner(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the numbers of the spans that rows belong to; -1 for `PADDING`."""
         return self._starts.searchsorted(rows, "right") - 1
 
-    def _open(self, feature: str, number: int) -> NDArray[Any]:
-        """Return the values of a span."""
-        values = self._values[feature][number]
-        if values is None:
-            span = self._spans[number]
-            read = self._images if _is_camera(feature) else self._vectors
-            values = self._values[feature][number] = read(feature, span)
-        return values
+    def _open(self, feature: str, number: int) -> NDArray[np.uint8]:
+        """Open the images of a span, and return them."""
+        frames = self._frames[feature][number] = self._images(feature, self._spans[number])
+        return frames
+
+    def _read(self, feature: str, number: int) -> None:
+        """Read the vectors of a span."""
+        first, span = int(self._starts[number]), self._spans[number]
+        vectors = self._vectors[feature]
+        vectors.values[first : first + span.stop - span.start] = self._stored(feature, span)
+        vectors.known[number] = True
 
     def _images(self, feature: str, span: _Span) -> NDArray[np.uint8]:
         dataset = self._datasets[span.dataset]
@@ -163,7 +199,7 @@ class StoredRows:
         frames = dataset.iter_frames(span.episode, feature, span.start, span.stop)
         return np.stack([self._converted(frame) for frame in frames])
 
-    def _vectors(self, feature: str, span: _Span) -> NDArray[np.float32]:
+    def _stored(self, feature: str, span: _Span) -> NDArray[np.float32]:
         dataset, digests = self._datasets[span.dataset], FeatureDigests()
         record = dataset.record(span.episode)
         values = dataset.read_vectors(span.episode, feature, 0, record.length)
