@@ -96,11 +96,13 @@ def check_features(path: str, config: Any, before: Any, memory: Memory | None) -
         if memory is None:
             how = (
                 f"Train it on {FRONT}, {WRIST}, {STATE} and {ACTION} of a buffer set's executions; "
+                "see docs/how-to/connect-a-policy.md."
             )
-            how += "see docs/how-to/connect-a-policy.md."
         else:
-            how = "Train it with robomme-interference train, which makes all its images squares of "
-            how += "`image_size`; see docs/how-to/train-a-policy.md."
+            how = (
+                "Train it with robomme-interference train, which makes all its images squares of "
+                "`image_size`; see docs/how-to/train-a-policy.md."
+            )
         raise PolicyError(f"the policy {path} does not fit: it {'; it '.join(wrong)}", how)
 
 
