@@ -1,5 +1,7 @@
 """Isolation: every test runs without the network and tokens, and with separate caches."""
 
+import functools
+import gc
 import logging
 import os
 import shutil
@@ -8,7 +10,7 @@ import socket
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +55,7 @@ os.environ.update(_SET)
 
 # No deadline: the first example of a test may import a library. In CI the examples are the same
 # in every run, so that a change is never blamed for what another one did.
-for _profile, _examples in (("few", 30), ("all", 100)):
+for _profile, _examples in (("few", 30), ("all", 50)):
     hypothesis.settings.register_profile(
         _profile, max_examples=_examples, deadline=None, derandomize=bool(os.environ.get("CI"))
     )
@@ -71,6 +73,17 @@ def pytest_configure(config: pytest.Config) -> None:
 
     messages.configure(config)
     hypothesis.settings.load_profile("few" if config.option.markexpr else "all")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, Any, Any]:
+    """Let the garbage collector leave alone what lives to the end: modules and tests."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -112,6 +125,16 @@ def _loopback_only() -> Iterator[None]:
         patch.setattr(socket, "getaddrinfo", guarded_lookup)
         for name in ("connect", "connect_ex"):
             patch.setattr(socket.socket, name, guarded(getattr(socket.socket, name)))
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _commands_are_made_once() -> Iterator[None]:
+    """Keep Click's commands, which Typer makes anew for each command line that it runs."""
+    import typer.main
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(typer.main, "get_command", functools.cache(typer.main.get_command))
         yield
 
 

@@ -156,6 +156,7 @@ GUESSERS: dict[str, Callable[[Made, int], Any]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", GUESSERS)
 def test_who_sees_no_history_is_right_by_chance(made: list[Made], name: str) -> None:
     """By one rule and by its opposite, over all families and within each."""

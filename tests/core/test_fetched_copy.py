@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from support import runs, worlds
 from support.buffer_sets import GOLDEN, copy_buffer_set
-from support.hub import BUFFER_SET, push_buffer_set
+from support.hub import BUFFER_SET, push_buffer_set, running_hub
 from support.hub_server import HubServer
 from support.tabletop import TABLETOP
 
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.verify.buffer_set import verify_buffer_set
+from robomme_interference_data.data.fetch import fetch
+from robomme_interference_data.data.fetch_plan import FetchConfig, plan_fetch
 from robomme_interference_data.data.questions import read_questions
 from robomme_interference_data.errors import (
     FormatError,
@@ -39,11 +41,21 @@ def published(hub: HubServer, tmp_path: Path) -> Iterator[HubServer]:
     yield hub
 
 
-@pytest.fixture
-def part(published: HubServer, run: Run, tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def fetched(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the buffers of one query under two conditions, seen by one camera."""
-    assert run("fetch", BUFFER_SET, *PART, "--to", tmp_path / "part")[0] == 0
-    return tmp_path / "part"
+    folder = tmp_path_factory.mktemp("fetched")
+    with pytest.MonkeyPatch.context() as patch, running_hub(folder / "cache", patch) as server:
+        push_buffer_set(server, GOLDEN, folder / "work")
+        config = FetchConfig(families=("MoveCube",), conditions=("k0", "k1"), cameras=("front",))
+        fetch(plan_fetch(load_buffer_set(BUFFER_SET), config, folder / "part"), folder / "part")
+    return folder / "part"
+
+
+@pytest.fixture
+def part(fetched: Path, tmp_path: Path) -> Path:
+    """That copy as a folder of the test's own."""
+    return copy_buffer_set(tmp_path / "part", fetched)
 
 
 def digests(folder: Path) -> dict[str, str]:

@@ -235,7 +235,7 @@ def test_errors_bound_the_difference_of_two_falls(tmp_path: Path) -> None:
 GRIDS = 60
 
 # Runs, and the standard deviation of their rates. `benchmarks/null_scores.py` has all cases.
-CASES = [(3, 0.0), (3, 0.05), (3, 0.1), (5, 0.0), (5, 0.05), (5, 0.1)]
+CASES = [(3, 0.0), (3, 0.1), (5, 0.05)]
 
 
 @pytest.mark.slow
