@@ -37,17 +37,19 @@ def reduced(data: "HistoryDataset", arguments: dict[str, Any]) -> tuple[Any, ...
     files = data.buffer_set.files
     # Another process may have another working directory.
     location = str(files.root.absolute()) if isinstance(files, LocalFiles) else files.location
-    return open_again, (location, arguments, data._epoch, data.content)
+    return open_again, (type(data), location, arguments, data._epoch, data.content)
 
 
 def open_again(
-    location: str, arguments: dict[str, Any], epoch: Epoch, content: str
+    kind: "type[HistoryDataset]",
+    location: str,
+    arguments: dict[str, Any],
+    epoch: Epoch,
+    content: str,
 ) -> "HistoryDataset | Unusable":
     """Return a dataset in another process, with the same items."""
-    from .history_dataset import HistoryDataset
-
     try:
-        made = HistoryDataset(location, **arguments, quiet=True)
+        made = kind(location, **arguments, quiet=True)
         # Items are numbered over all episodes: in a set that grew, an index means another moment.
         if made.content != content:
             raise HashMismatchError(

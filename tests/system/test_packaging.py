@@ -42,9 +42,10 @@ print(len({names!r}), sorted(heavy & set(sys.modules)))
 
 
 def core_modules() -> list[str]:
-    """All of it but the areas, the simulators, and the cluster, which are loaded at use."""
+    """All of it but what is loaded at use: the areas, training, the simulators, the cluster."""
     cluster = {f"{PACKAGE}.runtime.ray_cluster", f"{PACKAGE}.runtime.ray_actors"}
-    others = {*MAPPING, f"{PACKAGE}.simulators", *cluster} - {PACKAGE}
+    training = f"{PACKAGE}.training"
+    others = {*MAPPING, training, f"{PACKAGE}.simulators", *cluster} - {PACKAGE}
     return sorted(
         name for name in MODULES if not any(f"{name}.".startswith(f"{one}.") for one in others)
     )
