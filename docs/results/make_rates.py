@@ -1,4 +1,10 @@
-"""Write training/rates.csv: how rollouts of each system end, also by family and training seed."""
+"""Write training/rates.csv: how rollouts of each system end, also by family and training seed.
+
+Beside the names that training.md explains, `wide` is `mixture` with same-k3, held-k3 and parts-k3
+in training, `long` with k15 and k31; `window` has the last 32 frames in memory, `full` all;
+`sampled` has 32 even samples, trained as `full`: 800 batches of 8, no attention dropout; `acted`
+are rollouts that carry out a learner's answers.
+"""
 
 import csv
 import io
