@@ -22,6 +22,15 @@ from robomme_interference_data.storage.text import read_json
 
 WORDS = 1024  # buckets for hashed words
 CHANNELS = 16  # of a frame's feature map
+FARTHEST = 10  # power of 2 of the most frames by which `shifted` moves a memory, plus one
+
+POSITIONS = {
+    "both": "from the beginning and back from now",
+    "absolute": "from the beginning, for memory alone, so that no delay shows",
+    "relative": "back from now",
+    "shifted": "both, moved at random in training by 0 to 1,023 frames each",
+}
+"""From where a model counts the frames to each frame in memory."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +51,7 @@ class Config:
     trunk: str = "transformer"
     attention_dropout: bool = True  # False: attention over a long memory is several times as fast
     pictures: bool = True  # False: the control, with its memory's positions and lengths only
+    positions: str = "both"  # a key of POSITIONS
     seed: int = 0
     training_step: int = 0
     training_steps: int = 0
@@ -191,9 +201,20 @@ class MemoryModel(nn.Module):
 
     def _time(self, batch: dict[str, Any]) -> Tensor:
         """Return how old each frame is and how far from the beginning, `(B, M + 1, width)`."""
-        live = batch["position"][:, None]
+        live, kind = batch["position"][:, None], self.config.positions
         positions = torch.cat([batch["memory.position"], live], 1)
-        far = torch.log1p(torch.stack([live - positions, positions], -1).float())
+        frames = torch.stack([live - positions, positions], -1).float()
+        if kind == "shifted" and self.training:
+            # As if something were before the memory, and something between it and now. Short
+            # moves are as frequent as long ones, as k = 0, 1, 3, 7, … in a mixture.
+            moved = torch.exp2(FARTHEST * torch.rand(len(frames), 1, 2, device=frames.device)) - 1
+            frames[:, :-1] += moved
+            frames[:, -1:, 1:] += moved.sum(-1, keepdim=True)
+        if kind == "relative":
+            frames[..., 1] = 0
+        elif kind == "absolute":
+            frames[..., 0] = frames[:, -1, 1] = 0
+        far = torch.log1p(frames)
         time: Tensor = self.time(_with_waves(far))
         return time
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import torch
 from command_line import default_device, device, names, number, run, weights, whole
-from memory_model import Config, MemoryModel, on_device, save_checkpoint
+from memory_model import POSITIONS, Config, MemoryModel, on_device, save_checkpoint
 from torch.nn import functional
 from torch.utils.data import DataLoader
 
@@ -54,6 +54,8 @@ def arguments() -> argparse.Namespace:
     add("--unit-episodes", "with --redraw, indices of episodes whose units may be drawn")
     add("--trunk", "reader of the memory", choices=("transformer", "gru"), default="transformer")
     add("--no-pictures", "the control: memory without pictures and states", action="store_true")
+    where = "; ".join(f"{name}: {text}" for name, text in POSITIONS.items())
+    add("--positions", f"frames to a frame in memory, {where}", choices=POSITIONS, default="both")
     add("--width", "values of a token", type=whole(4, 4), default=96)
     add("--layers", "layers of the trunk", type=whole(1), default=2)
     add("--no-attention-dropout", "faster with --memory full", action="store_true")
@@ -111,6 +113,7 @@ def main(args: argparse.Namespace) -> None:
         attention_dropout=not args.no_attention_dropout,
         trunk=args.trunk,
         pictures=not args.no_pictures,
+        positions=args.positions,
         seed=args.seed,
         training_steps=args.steps,
     )

@@ -6,6 +6,7 @@ import re
 import shutil
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,37 @@ def test_actions_need_not_have_the_size_of_states() -> None:
     actions = model(batch(2))
     assert actions.shape == (2, 4, 10)
     assert abs(actions.mean().item() - 5) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("positions", "before", "between"),  # whether what is moved by this changes the actions
+    [("both", True, True), ("absolute", True, False), ("relative", False, True)],
+)
+def test_from_where_frames_are_counted(positions: str, before: bool, between: bool) -> None:
+    """Sessions before the lesson move memory and now; sessions after it move now alone."""
+    from memory_model import Config, MemoryModel
+
+    def actions(memory_moved: int, now_moved: int) -> torch.Tensor:
+        batch = {
+            "observation.state": torch.zeros(1, 8),
+            "memory.state": torch.zeros(1, 3, 8),
+            "memory.position": memory_moved + torch.arange(3)[None],
+            "memory.is_pad": torch.zeros(1, 3, dtype=torch.bool),
+            "position": torch.tensor([3 + now_moved]),
+            "task": ["place the cup"],
+        }
+        return model(batch)
+
+    torch.manual_seed(0)
+    config = Config(task="act", data="", memory="full", cameras=(), image_size=16)
+    model = MemoryModel(replace(config, positions=positions)).eval()
+    here = actions(0, 0)
+    assert torch.equal(here, actions(224, 224)) is not before
+    assert torch.equal(here, actions(0, 224)) is not between
+    model = MemoryModel(replace(config, positions="shifted"))
+    assert not torch.equal(actions(0, 0), actions(0, 0))  # moved at random, in training alone
+    model.eval()
+    assert torch.equal(actions(0, 0), actions(0, 0))
 
 
 @pytest.mark.slow
