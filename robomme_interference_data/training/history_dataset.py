@@ -16,7 +16,7 @@ from robomme_interference_data.data.dataset import camera_feature
 from robomme_interference_data.data.loading import load_buffer_set, open_cache
 from robomme_interference_data.data.state_reader import other_state_sizes, query_state_size
 from robomme_interference_data.data.views import shifted_view
-from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
+from robomme_interference_data.errors import HashMismatchError, InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.stored_selector import StoredSelector
@@ -25,6 +25,7 @@ from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.schema.other_states import check_rule, check_sizes
 from robomme_interference_data.schema.sampling import Memory, spread
 from robomme_interference_data.schema.shifts import NO_SHIFT, Shift, parse_shift
+from robomme_interference_data.storage.files import LocalFiles
 from robomme_interference_data.storage.text import digest_json
 
 from .batches import Batches, Drawn
@@ -35,7 +36,7 @@ from .items import Items, item_of
 from .lerobot_layout import LeRobotMeta, LeRobotReads, describe, renamed, transform_images
 from .moments import check_arguments, check_size, choose_moments, drawable_rows, needed_datasets
 from .question_tensors import QuestionTensors
-from .reopening import reduced
+from .reopening import made_or_unusable
 from .rows import StoredRows
 
 if TYPE_CHECKING:
@@ -226,7 +227,26 @@ class HistoryDataset(LeRobotReads):
         self._epoch = Epoch(len(self), draws=redraw or several)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return reduced(self, self._arguments)
+        # Memory maps and tables cannot be pickled: another process opens the buffer set again. It
+        # may have another working directory.
+        files = self.buffer_set.files
+        location = str(files.root.absolute()) if isinstance(files, LocalFiles) else files.location
+        made = (HistoryDataset._opened_again, location, self._arguments, self._epoch, self.content)
+        return made_or_unusable, made
+
+    @classmethod
+    def _opened_again(
+        cls, location: str, arguments: dict[str, Any], epoch: Epoch, content: str
+    ) -> "HistoryDataset":
+        made = cls(location, **arguments, quiet=True)
+        # Items are numbered over all episodes: in a set that grew, an index means another moment.
+        if made.content != content:
+            raise HashMismatchError(
+                f"{location} was changed since the training began: a worker finds other items",
+                "Start the training again; do not change a buffer set that is in use.",
+            )
+        made._epoch = epoch
+        return made
 
     def __len__(self) -> int:
         """Return the number of items."""

@@ -1,18 +1,9 @@
-"""A `HistoryDataset` in another process, such as a spawned worker of a loader.
+"""What stands for a dataset that a spawned worker of a loader cannot open again."""
 
-Memory maps and tables cannot be pickled: the other process opens the buffer set again.
-"""
+from collections.abc import Callable, Sequence
+from typing import Any
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
-
-from robomme_interference_data.errors import HashMismatchError, InterferenceError
-from robomme_interference_data.storage.files import LocalFiles
-
-from .epoch import Epoch
-
-if TYPE_CHECKING:
-    from .history_dataset import HistoryDataset
+from robomme_interference_data.errors import InterferenceError
 
 
 class Unusable:
@@ -32,31 +23,9 @@ class Unusable:
         raise self._error
 
 
-def reduced(data: "HistoryDataset", arguments: dict[str, Any]) -> tuple[Any, ...]:
-    """Return what pickles a dataset: a function, and what it needs to open it again."""
-    files = data.buffer_set.files
-    # Another process may have another working directory.
-    location = str(files.root.absolute()) if isinstance(files, LocalFiles) else files.location
-    return open_again, (type(data), location, arguments, data._epoch, data.content)
-
-
-def open_again(
-    kind: "type[HistoryDataset]",
-    location: str,
-    arguments: dict[str, Any],
-    epoch: Epoch,
-    content: str,
-) -> "HistoryDataset | Unusable":
-    """Return a dataset in another process, with the same items."""
+def made_or_unusable[T](make: Callable[..., T], *arguments: Any) -> T | Unusable:
+    """Return what a function makes, or what raises its error when an item is taken."""
     try:
-        made = kind(location, **arguments, quiet=True)
-        # Items are numbered over all episodes: in a set that grew, an index means another moment.
-        if made.content != content:
-            raise HashMismatchError(
-                f"{location} was changed since the training began: a worker finds other items",
-                "Start the training again; do not change a buffer set that is in use.",
-            )
+        return make(*arguments)
     except InterferenceError as error:
         return Unusable(error)
-    made._epoch = epoch
-    return made
