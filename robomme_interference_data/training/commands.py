@@ -58,10 +58,10 @@ def train(
       --config_path=runs/act/checkpoints/last/pretrained_model/train_config.json
     ```
     """
-    from .lerobot_version import check_lerobot
+    from .lerobot.version import check_lerobot
 
     check_lerobot()
-    from . import lerobot_train
+    from .lerobot import loop
 
     given = {
         "conditions": None if conditions is None else dict(map(_weighted, conditions)),
@@ -73,7 +73,7 @@ def train(
         "unit_episodes": unit_episodes,
         "other_states": other_states,
     }
-    lerobot_train.train(lerobot_train.arguments(buffer_set, given, lerobot or []))
+    loop.train(loop.arguments(buffer_set, given, lerobot or []))
 
 
 def _weighted(text: str) -> tuple[str, float]:

@@ -33,7 +33,7 @@ from .draws import Weights
 from .epoch import Epoch
 from .histories import Histories
 from .items import Items, item_of
-from .lerobot_layout import LeRobotMeta, LeRobotReads, describe, renamed, transform_images
+from .layout import LeRobotMeta, LeRobotReads, describe, renamed, transform_images
 from .moments import check_arguments, check_size, choose_moments, drawable_rows, needed_datasets
 from .question_tensors import QuestionTensors
 from .reopening import made_or_unusable

@@ -22,7 +22,7 @@ from robomme_interference_data.ids import EpisodeId, format_numbers, parse_numbe
 from robomme_interference_data.schema.conditions import datasets_of, parse_condition
 from robomme_interference_data.schema.shifts import NO_SHIFT
 
-from .lerobot_layout import LAYOUTS
+from .layout import LAYOUTS
 from .rows import StoredRows
 
 _NO_ACTIONS = "Items without actions (chunk=0) need no executions."

@@ -19,10 +19,10 @@ from robomme_interference_data.errors import (
     InvalidOptionError,
     MissingExtraError,
 )
-from robomme_interference_data.training.lerobot_version import TESTED, check_lerobot
+from robomme_interference_data.training.lerobot.version import TESTED, check_lerobot
 
 pytest.importorskip("lerobot")
-training = lazy("robomme_interference_data.training.lerobot_train")
+training = lazy("robomme_interference_data.training.lerobot.loop")
 small = lazy("support.memory_policies")
 Train = Callable[..., Path]
 

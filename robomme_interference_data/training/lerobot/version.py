@@ -1,4 +1,4 @@
-"""The version of LeRobot whose training loop `lerobot_train` runs."""
+"""The version of LeRobot whose training loop `loop` runs."""
 
 from importlib import metadata, util
 

@@ -30,8 +30,7 @@ from robomme_interference_data.errors import HashMismatchError, InvalidOptionErr
 from robomme_interference_data.ids import format_numbers, parse_numbers
 from robomme_interference_data.schema.sampling import spread
 from robomme_interference_data.storage.files import LocalFiles
-
-from .history_dataset import HistoryDataset
+from robomme_interference_data.training.history_dataset import HistoryDataset
 
 
 @dataclass
