@@ -29,6 +29,7 @@ the arrows with the code."""
 
 ARROWS = (
     ("cli", "cards"),
+    ("cli", "training"),
     ("cards", "build_dataset"),
     ("cards", "evaluate"),
     ("build_dataset", "simulators"),

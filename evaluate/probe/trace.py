@@ -64,7 +64,7 @@ class Trace:
 
     def told(self, step: int, subgoal: Subgoal) -> None:
         """Add a subgoal."""
-        self._add(Component.WRITER, step, np.frombuffer(subgoal.grounded.encode(), np.uint8))
+        self._add(Component.WRITER, step, _bytes(subgoal.grounded))
 
     def acted(self, step: int, action: NDArray[np.float32]) -> None:
         """Add an action of the policy."""
@@ -73,7 +73,7 @@ class Trace:
 
     def ended(self, step: int, status: str) -> None:
         """Add how the simulator ended the rollout."""
-        self._add(Component.SIMULATOR, step, np.frombuffer(status.encode(), np.uint8))
+        self._add(Component.SIMULATOR, step, _bytes(status))
 
     @contextmanager
     def errors_of(self, component: Component, step: int = 0) -> Iterator[None]:
@@ -85,7 +85,7 @@ class Trace:
                 self.error = error.message
             else:
                 self.error = first_line(error)
-            self._add(component, step, np.frombuffer(self.error.encode(), np.uint8))
+            self._add(component, step, _bytes(self.error))
             raise
 
     def _add(self, component: Component, step: int, *arrays: NDArray[Any]) -> None:
@@ -132,3 +132,8 @@ def digest_of(plays: Sequence[Play]) -> str:
     """Return a digest of all values of plays."""
     events = (event for play in plays for event in play.events)
     return hashlib.sha256(b"".join(event.digest for event in events)).hexdigest()
+
+
+def _bytes(text: str) -> NDArray[np.uint8]:
+    # An error may quote a file name, which may hold what is no UTF-8.
+    return np.frombuffer(text.encode(errors="backslashreplace"), np.uint8)
