@@ -18,6 +18,7 @@ from robomme_interference_data.constants import ACTION, STATE
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.memory_features import MEMORY_PADDING, POSITION, in_memory
 from robomme_interference_data.storage.lerobot.statistics import (
     ImageStats,
     Statistics,
@@ -30,10 +31,10 @@ LAYOUTS = ("plain", "lerobot")
 """The names of entries: those of `HistoryDataset`, or those of this module."""
 
 _RENAMED = {
-    "memory.is_pad": "observation.memory.padding",
+    "memory.is_pad": MEMORY_PADDING,
     "memory.evidence": "label.evidence",
     "evidence_known": "label.evidence_known",
-    "position": "observation.position",
+    "position": POSITION,
     "question.answer": "label.answer",
     "condition": "label.condition",
     "shift": "label.shift",
@@ -49,11 +50,6 @@ _SAMPLED_IMAGES = 256
 def renamed(batch: Mapping[str, Any]) -> dict[str, Any]:
     """Return an item or a batch with the names of the layout `lerobot`."""
     return {_renamed(name): values for name, values in batch.items()}
-
-
-def in_memory(feature: str) -> str:
-    """Return the name of the memory of `observation.state`, or of a camera."""
-    return _renamed(_in_memory(feature))
 
 
 def _renamed(name: str) -> str:
@@ -81,7 +77,7 @@ def transform_images(
     """
     for place, key in enumerate(keys):
         for camera in cameras:
-            now, memory = batch[camera][place], batch[_in_memory(camera)][place]
+            now, memory = batch[camera][place], batch[_plain(camera)][place]
             # On CPUs only: other generators belong to the training.
             with torch.random.fork_rng(devices=[]):
                 torch.manual_seed(number_from("transform", *key, camera))
@@ -91,8 +87,9 @@ def transform_images(
             now.copy_(pixels[-1])
 
 
-def _in_memory(feature: str) -> str:
-    return f"memory.{feature.removeprefix('observation.')}"
+def _plain(feature: str) -> str:
+    """Return the name of a feature's values in memory, in the layout `plain`."""
+    return in_memory(feature).removeprefix("observation.")
 
 
 class LeRobotReads:
