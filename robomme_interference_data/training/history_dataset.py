@@ -33,7 +33,7 @@ from .draws import Weights
 from .epoch import Epoch
 from .histories import Histories
 from .items import Items, item_of
-from .layout import LeRobotMeta, LeRobotReads, describe, renamed, transform_images
+from .layout import LeRobotMeta, describe, renamed, transform_images
 from .moments import check_arguments, check_size, choose_moments, drawable_rows, needed_datasets
 from .question_tensors import QuestionTensors
 from .reopening import made_or_unusable
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from robomme_interference_data.storage.cache import DecodedCache
 
 
-class HistoryDataset(LeRobotReads):
+class HistoryDataset:
     """Moments of executions, with the memory that a policy has at that step of a rollout.
 
     Item `i` is moment t of an execution, the part of an episode after its lesson. Its history is
@@ -297,6 +297,20 @@ class HistoryDataset(LeRobotReads):
         used = self._moments.first if feature == ACTION else self._used
         rows = self._rows.of_same_sessions(used)
         return self._rows.take(feature, rows if most is None else rows[spread(0, len(rows), most)])
+
+    # LeRobot's training reads these of a dataset: all episodes of `meta` are in use, in its order.
+    episodes = None
+    absolute_to_relative_idx = None
+
+    @property
+    def num_frames(self) -> int:
+        """Number of items, by LeRobot's name."""
+        return len(self)
+
+    @property
+    def num_episodes(self) -> int:
+        """Number of query episodes, by LeRobot's name."""
+        return len(self.episode_ids)
 
     @cached_property
     def meta(self) -> LeRobotMeta:

@@ -7,7 +7,6 @@ below `label.`.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -90,33 +89,6 @@ def transform_images(
 def _plain(feature: str) -> str:
     """Return the name of a feature's values in memory, in the layout `plain`."""
     return in_memory(feature).removeprefix("observation.")
-
-
-class LeRobotReads:
-    """What LeRobot's training loop asks a dataset for, beside items.
-
-    Attributes:
-        episodes: None: all episodes of `meta` are in use.
-        absolute_to_relative_idx: None: indices of items are those of `meta`.
-    """
-
-    episodes = None
-    absolute_to_relative_idx = None
-
-    @cached_property
-    def meta(self) -> "LeRobotMeta":
-        """What it is asked beside items."""
-        raise NotImplementedError
-
-    @property
-    def num_frames(self) -> int:
-        """Number of items."""
-        return self.meta.total_frames
-
-    @property
-    def num_episodes(self) -> int:
-        """Number of query episodes."""
-        return self.meta.total_episodes
 
 
 @dataclass(frozen=True)

@@ -116,16 +116,22 @@ def test_views_under_shifts(make: Make, buffers: Path) -> None:
     np.testing.assert_array_equal(item["observation.images.front"], view.transpose(2, 0, 1) >> 2)
 
 
+def with_questions(cache: Path) -> HistoryDataset:
+    return HistoryDataset(
+        TABLETOP,
+        ["k0"],
+        split="test",
+        image_size=8,
+        chunk=0,
+        questions=True,
+        cache=cache,
+        quiet=True,
+    )
+
+
 @pytest.mark.slow
 def test_questions_as_tensors(tmp_path: Path) -> None:
-    options: dict[str, Any] = {
-        "split": "test",
-        "chunk": 0,
-        "questions": True,
-        "cache": tmp_path,
-        "quiet": True,
-    }
-    data = HistoryDataset(TABLETOP, ["k0"], image_size=8, **options)
+    data = with_questions(tmp_path)
     questions = read_questions(load_buffer_set(TABLETOP))
     for number, episode in enumerate(data.episode_ids):
         item, question = data[number], questions[episode]
@@ -208,14 +214,7 @@ def test_episodes_of_one_split(make: Make, buffers: Path) -> None:
 
 @pytest.mark.slow
 def test_a_batch_of_questions_and_shifts(make: Make, tmp_path: Path) -> None:
-    options: dict[str, Any] = {
-        "split": "test",
-        "chunk": 0,
-        "questions": True,
-        "cache": tmp_path,
-        "quiet": True,
-    }
-    asked = HistoryDataset(TABLETOP, ["k0"], image_size=8, **options)
+    asked = with_questions(tmp_path)
     shifted = make(["k0"], chunk=0, shifts={"none": 1, str(SHIFTS[2]): 1}, seed=3)
     assert len({shifted[index]["shift"] for index in range(3)}) == 2
     for data in (asked, shifted):
