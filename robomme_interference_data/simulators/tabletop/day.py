@@ -111,7 +111,7 @@ class Transition(EmptyTable):
         """Add the stick to the loaded scene, if one of the tasks has one."""
         self._robot = env.agent.robot._objs[0]
         self._stick = None
-        if any(self._sticks) and env.drawing:
+        if any(self._sticks) and env.scene.can_render():
             import sapien
 
             from .drawing import stick_shape
