@@ -119,6 +119,9 @@ SHIFTED = "shifted"
 EXECUTIONS = "executions"
 """Recordings of the queries from the first live observation on, with actions."""
 
+DAYS = "days"
+"""Recordings of a robot's days: many tasks, without a cut."""
+
 LESSONS = (DEMONSTRATIONS, CONTRADICTIONS)
 """Datasets of lessons followed by their first live observation."""
 
@@ -165,7 +168,7 @@ PAPER_UNIT = Unit(UNIT_FRAMES, UNIT_STRIDE)
 UNITS = (DISTRACTORS, RAW_DISTRACTORS)
 """Datasets of units."""
 
-OPTIONAL_DATASETS = (RAW_DISTRACTORS, CONTRADICTIONS, SHIFTED, EXECUTIONS)
+OPTIONAL_DATASETS = (RAW_DISTRACTORS, CONTRADICTIONS, SHIFTED, EXECUTIONS, DAYS)
 """Datasets that a buffer set may lack; on the Hub, folders of its repository."""
 
 DATASETS = (DEMONSTRATIONS, DISTRACTORS, *OPTIONAL_DATASETS)

@@ -227,7 +227,9 @@ class AskFunction(RunFunction[AskConfig]):
             received = self.selector.select(buffer, query.frame(self.selector.camera)).tolist()
         memory = Memory.parse(config.memory)
         kept = memory.kept(received)
-        known = None if buffer.evidence is None else known_parts(buffer.evidence, kept)
+        known = None
+        if buffer.evidence is not None:
+            known = known_parts(buffer.evidence, kept, first_counts=query.first_counts)
         history = HistoryFrames(buffer, kept, self.history)  # decoded only for a model
         prompted = Prompted(question, query, config.model_seed, known, history)
         right = question.letters[question.right]
@@ -251,6 +253,7 @@ class AskFunction(RunFunction[AskConfig]):
             Status.SUCCESS if letter == right else Status.FAIL,
             seed=query.seed,
             difficulty=query.difficulty,
+            ability=query.record.ability,
             goal=query.goal,
             steps=0,  # nothing is executed
             **history_columns(buffer, received, memory, retrieved=self.selector is not None),
