@@ -1,6 +1,6 @@
 """The source `tabletop-day`: days of the embedded simulator, and the queries about them."""
 
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from typing import Any, override
 
 from robomme_interference_data.constants import DAYS, UNITS
@@ -12,6 +12,7 @@ from robomme_interference_data.schema.days import (
     plan_day,
     queries_of,
 )
+from robomme_interference_data.schema.records import Day
 
 from .base import Frame, Recording, SourceEpisode
 from .simulator import SimulatorSource
@@ -54,23 +55,18 @@ class DaySource(SimulatorSource):
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
         if self._kind != DAYS:
             return super().read(episode, cameras)
-        from robomme_interference_data.simulators.tabletop.day import PlayedDay
-
-        chosen = self._chosen(cameras)
-        simulator: Any = self._open(chosen)
-        others = self._class.extra_episodes()
-        plan = plan_day(episode.id, others, self._class.other_answer)
-        played = PlayedDay(simulator, plan)
-        goal = f"do the {len(plan.tasks)} tasks of the day"
+        simulator: Any = self._open(self._chosen(cameras))
+        plan = plan_day(episode.id, self._class.extra_episodes(), self._class.other_answer)
+        played = simulator.play_day(plan)
         return Recording(
-            goals=(goal,),
+            goals=(f"do the {len(plan.tasks)} tasks of the day",),
             seed=None,
             difficulty=None,
             simulator=self.name,
             exact=True,
             frames=_frames(played),
             robot=self._robot(),
-            day=played.day,
+            day=lambda: Day(tuple(played.spans), plan.queries),
         )
 
     def _days(self) -> list[EpisodeId]:
@@ -85,6 +81,5 @@ class DaySource(SimulatorSource):
 
 
 def _frames(played: Any) -> Generator[Frame]:
-    frames: Iterator[Any] = played.frames()
-    for seen, action in frames:
+    for seen, action in played.frames():
         yield Frame(seen.images, seen.state, action, None)
