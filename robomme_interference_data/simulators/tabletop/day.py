@@ -174,10 +174,16 @@ class PlayedDay:
             next(self._begin(task)[1])
             way = Transition(standing, self._standing())
             source = self._plan.day
-            yield from self._span(DaySpan(source, "transition", task.shift, 0, 0, "", ()), self._travel(way, task))
+            yield from self._span(
+                DaySpan(source, "transition", task.shift, 0, 0, "", ()), self._travel(way, task)
+            )
             parts, script = self._begin(task)
             source = task.episode or source
-            yield from self._span(DaySpan(source, task.part, task.shift, 0, 0, "", ()), self._play(script, task), parts)
+            yield from self._span(
+                DaySpan(source, task.part, task.shift, 0, 0, "", ()),
+                self._play(script, task),
+                parts,
+            )
             standing = self._standing()
 
     def _span(
