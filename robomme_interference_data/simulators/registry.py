@@ -37,7 +37,8 @@ def make_simulator(name: str, **options: Any) -> Simulator:
     """Make a simulator in this process; make only one per process.
 
     Args:
-        name: `tabletop`, `tabletop-day`, `robomme`, or `module:name` of a class or function of your own.
+        name: `tabletop`, `tabletop-day`, `robomme`, or `module:name` of a class or function of your
+            own.
         **options: Passed to the simulator; see `TabletopSimulator` and `RoboMMESimulator`.
 
     Raises:

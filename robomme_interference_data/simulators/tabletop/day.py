@@ -5,6 +5,7 @@ the old one slide out of view and those of the new one slide in, while the arm g
 pose to the other: a scene of its own holds both, and nothing in it is subject to physics.
 """
 
+import gc
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 Frame = tuple[Observation, NDArray[np.float32]]
 """An observation, and the action `(8,) float32` that is executed after it."""
 
-TABLE: Color = (0.62, 0.60, 0.56)
+TABLE: Color = (0.58, 0.56, 0.50)
 """Color of the table, on which the things of all families are visible."""
 
 IDLE = 32
@@ -110,7 +111,7 @@ class Transition(EmptyTable):
         """Add the stick to the loaded scene, if one of the tasks has one."""
         self._robot = env.agent.robot._objs[0]
         self._stick = None
-        if any(self._sticks) and env.drawing:
+        if any(self._sticks) and env.scene.can_render():
             import sapien
 
             from .drawing import stick_shape
@@ -167,29 +168,38 @@ class PlayedDay:
         The same plan gives the same frames, bit for bit.
         """
         self.spans.clear()
+        # ManiSkill collects garbage for every scene: that takes a third of a second unless it skips
+        # what was there before.
+        gc.freeze()
+        try:
+            yield from self._frames()
+        finally:
+            gc.unfreeze()
+
+    def _frames(self) -> Iterator[Frame]:
         self._env.load(EmptyTable())
         standing = self._standing()
         for task in self._plan.tasks:
             # The scene is built once to see how it begins, and once more to be played.
             next(self._begin(task)[1])
             way = Transition(standing, self._standing())
-            source = self._plan.day
-            yield from self._span(
-                DaySpan(source, "transition", task.shift, 0, 0, "", ()), self._travel(way, task)
-            )
+            transition = self._travel(way, task)
+            yield from self._span(self._plan.day, "transition", task.shift, transition)
             parts, script = self._begin(task)
-            source = task.episode or source
-            yield from self._span(
-                DaySpan(source, task.part, task.shift, 0, 0, "", ()),
-                self._play(script, task),
-                parts,
-            )
+            source = task.episode or self._plan.day
+            played = self._play(script, task)
+            yield from self._span(source, task.part, task.shift, played, parts)
             standing = self._standing()
 
     def _span(
-        self, span: DaySpan, frames: Iterator[_Shown], parts: Sequence[str] = ()
+        self,
+        source: EpisodeId,
+        part: str,
+        shift: str,
+        frames: Iterator[_Shown],
+        texts: Sequence[str] = (),
     ) -> Iterator[Frame]:
-        """Yield the frames of a span, then record it with its evidence; `parts` are texts."""
+        """Yield the frames of a span, then record it; `texts` are the parts of the answer."""
         start = self.spans[-1].stop if self.spans else 0
         shown = []
         for observation, action, showing in frames:
@@ -197,11 +207,10 @@ class PlayedDay:
             yield observation, action
         evidence = (
             replace(seen, start=start + seen.start, stop=start + seen.stop)
-            for seen in spans_of_parts(shown, parts)
+            for seen in spans_of_parts(shown, texts)
         )
-        self.spans.append(
-            replace(span, start=start, stop=start + len(shown), evidence=tuple(evidence))
-        )
+        stop = start + len(shown)
+        self.spans.append(DaySpan(source, part, shift, start, stop, "", tuple(evidence)))
 
     def _travel(self, way: Transition, task: PlannedTask) -> Iterator[_Shown]:
         """Yield the frames of a transition."""

@@ -86,7 +86,7 @@ def draw_low_polygon(articulation: Any, stick: float) -> None:
 
 
 def stick_shape(stick: float) -> Any:
-    """Return the shape of a stick, on the axes of the hand that holds it; see `draw_low_polygon`."""
+    """Return the shape of a stick of a length, in the axes of the hand that holds it."""
     wood = material((0.30, 0.18, 0.08), 0.7, 0.2)
     half = (stick + 0.04) / 2
     rod = sapien.render.RenderShapeCylinder(ROD, half, wood)
