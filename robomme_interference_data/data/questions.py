@@ -23,7 +23,7 @@ LETTERS = string.ascii_uppercase[:8]
 """Letters of options, in order."""
 
 NOT_SHOWN = -1
-"""Number in `Question.answers` of the option that it was not shown, which questions of days have."""
+"""Number in `Question.answers` of the option that it was not shown; only days have it."""
 
 
 # Five digits: no image that can be read has as many pixels on a side.
