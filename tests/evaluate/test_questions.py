@@ -232,10 +232,7 @@ def test_a_damaged_picture_breaks_only_its_question(tmp_path: Path) -> None:
         ({"control": "blnk"}, "control 'blnk' is none of none, blank, text"),
         ({"control": "blank"}, "`control` has no effect on recall"),
         ({"model": "guess", "memory": "window"}, "`memory` has no effect on guess"),
-        (
-            {"model": "recal"},
-            "there is no model 'recal'; expected recall, abstain, guess",
-        ),
+        ({"model": "recal"}, "there is no model 'recal'; expected recall, abstain, guess"),
         ({"model": "openai:http://h/v1#m", "system": "m", "prompt": "x"}, "no prompt or file 'x'"),
         ({"retrieval": "thumbnail", "conditions": ("no-history",)}, "nothing to retrieve from"),
     ],
