@@ -39,15 +39,13 @@ TASKS = range(8, 61)
 
 DEFAULT_TASKS = 30
 
-ABILITIES = ("recall", "several", "update", "order-first", "order-last", "absent")
-"""What a query of a day needs of a memory, in the order of tables: one lesson; two halves of a
-lesson, apart from each other; the newer one of two lessons with different answers; the first or the
-last of two, as the goal says; to know that there was no lesson."""
-
 _CYCLE = ("recall", "update", "order", "absent", "recall", "update")
 _CYCLE_IN_PIECES = ("several", "recall", "update", "absent", "several", "order")
 _IN_PIECES = ("VideoPlaceOrder", "VideoPlaceButton", "PatternLock", "RouteStick")
 """Families whose lessons show several parts of the answer, one after the other."""
+
+_LESSONS = {"recall": 1, "several": 2, "update": 2, "order-first": 2, "order-last": 2, "absent": 0}
+"""Tasks that are played for a query."""
 
 _WORDS = {
     "order-first": ", as it was shown the first time",
@@ -129,6 +127,17 @@ def query_indices(day: EpisodeId) -> range:
     return range(day.index * per_day, (day.index + 1) * per_day)
 
 
+def queries_of(day: EpisodeId) -> list[EpisodeId]:
+    """Return the query episodes of a day, in the order in which they are taken."""
+    taken, room = list[EpisodeId](), _early(day) * 3 // 4
+    for query in _candidates(day):
+        room -= _LESSONS[ability_of(query)]
+        if room < 0:
+            break
+        taken.append(query)
+    return taken
+
+
 def plan_day(
     day: EpisodeId, others: Iterable[EpisodeId], other_answer: Callable[[EpisodeId], int | None]
 ) -> DayPlan:
@@ -139,20 +148,12 @@ def plan_day(
         others: Episodes for tasks that no query asks about, in any order.
         other_answer: Returns the number of another answer of an episode; see `Simulator`.
     """
-    count = day_tasks(day)
-    early = count - count // 4
-    dealt: dict[EpisodeId, list[tuple[EpisodeId, str]]] = {}
-    used = 0
-    for query in _candidates(day):
-        lessons = _lessons(query, other_answer)
-        if used + len(lessons) > early * 3 // 4:
-            break
-        dealt[query] = lessons
-        used += len(lessons)
+    count, early = day_tasks(day), _early(day)
     places = sorted(range(early), key=lambda place: _lot(day, "place", place))
     tasks: dict[int, tuple[EpisodeId | None, str]] = {}
     queries = []
-    for query, lessons in dealt.items():
+    for query in queries_of(day):
+        lessons = _lessons(query, other_answer)
         own = sorted(places[len(tasks) : len(tasks) + len(lessons)])
         tasks |= dict(zip(own, lessons, strict=True))
         asked = own[-1] if own else _lot(day, "asked", query) % early
@@ -175,6 +176,11 @@ def plan_day(
     )
 
 
+def _early(day: EpisodeId) -> int:
+    """Return the number of tasks among which the lessons are."""
+    return day_tasks(day) - day_tasks(day) // 4
+
+
 def _candidates(day: EpisodeId) -> Iterator[EpisodeId]:
     """Yield the episodes that may be queries, in the order in which they are taken."""
     for index in query_indices(day):
@@ -195,10 +201,7 @@ def _lessons(
     if ability == "several":
         return [(query, "first"), (query, "second")]
     own = (query, "lesson")
-    other = (
-        EpisodeId(query.family, query.split, query.index, other_answer(query)),
-        "lesson",
-    )
+    other = (EpisodeId(query.family, query.split, query.index, other_answer(query)), "lesson")
     return [own, other] if ability == "order-first" else [other, own]
 
 
