@@ -22,8 +22,7 @@ from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.schema.other_states import OtherStates, fit_states
 from robomme_interference_data.storage.arrays import FeatureDigests
 from robomme_interference_data.storage.cache import DecodedCache
-
-from .images import resize
+from robomme_interference_data.storage.resize import resize
 
 PADDING = -1
 """The row of a place without a frame."""
