@@ -32,11 +32,10 @@ from .batches import Batches, Drawn
 from .draws import Weights
 from .epoch import Epoch
 from .histories import Histories
-from .items import Items, item_of
 from .layout import LeRobotMeta, describe, renamed, transform_images
+from .loaders import Items, item_of, made_or_unusable
 from .moments import check_arguments, check_size, choose_moments, drawable_rows, needed_datasets
 from .question_tensors import QuestionTensors
-from .reopening import made_or_unusable
 from .rows import StoredRows
 
 if TYPE_CHECKING:
