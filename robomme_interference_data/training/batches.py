@@ -10,6 +10,7 @@ from robomme_interference_data.constants import ACTION, STATE
 from robomme_interference_data.schema.sampling import Memory
 
 from .histories import DrawnHistory
+from .layout import memory_entry
 from .moments import Moments
 from .rows import PADDING, StoredRows
 
@@ -59,7 +60,7 @@ class Batches:
         now = np.array([drawn.now for drawn in items])
         for name in self._features:
             batch[name] = self._rows.take(name, now)
-            batch[f"memory.{name.removeprefix('observation.')}"] = self._rows.take(name, rows)
+            batch[memory_entry(name)] = self._rows.take(name, rows)
         moment = np.array([drawn.moment for drawn in items])
         batch["position"] = moment + [len(drawn.history.rows) for drawn in items]
         if self._chunk:

@@ -32,7 +32,9 @@ from .batches import Batches, Drawn
 from .draws import Weights
 from .epoch import Epoch
 from .histories import Histories
-from .layout import LeRobotMeta, describe, renamed, transform_images
+from .image_transforms import transform_images
+from .layout import renamed
+from .lerobot.meta import LeRobotMeta, describe
 from .loaders import Items, item_of, made_or_unusable
 from .moments import check_arguments, check_size, choose_moments, drawable_rows, needed_datasets
 from .question_tensors import QuestionTensors
