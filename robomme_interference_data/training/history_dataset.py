@@ -10,35 +10,31 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, SHIFTED, STATE
+from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, STATE
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import camera_feature
-from robomme_interference_data.data.loading import load_buffer_set, open_cache
-from robomme_interference_data.data.state_reader import other_state_sizes, query_state_size
-from robomme_interference_data.data.views import shifted_view
+from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import HashMismatchError, InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
-from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.stored_selector import StoredSelector
 from robomme_interference_data.schema.codec import to_dict
-from robomme_interference_data.schema.conditions import parse_condition
-from robomme_interference_data.schema.other_states import check_rule, check_sizes
 from robomme_interference_data.schema.sampling import Memory, spread
-from robomme_interference_data.schema.shifts import NO_SHIFT, Shift, parse_shift
+from robomme_interference_data.schema.shifts import NO_SHIFT
 from robomme_interference_data.storage.files import LocalFiles
 from robomme_interference_data.storage.text import digest_json
 
-from .batches import Batches, Drawn
+from .batches import Batches
 from .draws import Weights
 from .epoch import Epoch
 from .histories import Histories
 from .image_transforms import transform_images
+from .item_draws import ItemDraws
 from .layout import renamed
 from .lerobot.meta import LeRobotMeta, describe
 from .loaders import Items, item_of, made_or_unusable
-from .moments import check_arguments, check_size, choose_moments, drawable_rows, needed_datasets
+from .moments import choose_moments
+from .opening import check_arguments, open_rows
 from .question_tensors import QuestionTensors
-from .rows import StoredRows
 
 if TYPE_CHECKING:
     from robomme_interference_data.storage.cache import DecodedCache
@@ -145,73 +141,66 @@ class HistoryDataset:
         image_transforms: Callable[[torch.Tensor], torch.Tensor] | None = None,
         quiet: bool = False,
     ):
-        for option, given in (("cameras", cameras), ("families", families)):
-            if isinstance(given, str):
-                raise InvalidOptionError.expected(option, given, f"a list of names: [{given!r}]")
         opened = isinstance(buffer_set, BufferSet)
         self.buffer_set: BufferSet = buffer_set if opened else load_buffer_set(buffer_set)  # type: ignore[assignment,arg-type]
         if cameras is None:
             cameras = (self.buffer_set.datasets[DEMONSTRATIONS].camera(),)
         self._arguments = dict(
             conditions=conditions, memory=memory, cameras=cameras, image_size=image_size,
-            chunk=chunk, split=split, families=tuple(families), episodes=episodes,
+            chunk=chunk, split=split, families=families, episodes=episodes,
             retrieval=retrieval, retrieval_rule=retrieval_rule, retrieval_camera=retrieval_camera,
             shifts=shifts, questions=questions, redraw=redraw, unit_episodes=unit_episodes,
             other_states=other_states, seed=seed, cache=cache, layout=layout,
             image_transforms=image_transforms,
         )  # fmt: skip
+        self._conditions = Weights.parse("conditions", conditions)
+        shift_weights = Weights.parse("shifts", shifts or {NO_SHIFT: 1})
+        check_arguments(self._arguments, shift_weights.names)
         self.layout, self._image_transforms = layout, image_transforms
         self.memory, self.seed = Memory.parse(memory), seed
         self.chunk = whole_number("chunk", chunk, "an integer from 0", 0)
         self.cameras = tuple(camera_feature(camera) for camera in cameras)
-        self._conditions = Weights.parse("conditions", conditions)
-        self._shifts = Weights.parse("shifts", shifts or {NO_SHIFT: 1})
-        self._shift_of = {name: parse_shift(name) for name in self._shifts.names}
-        shifted, actions = self._shifts.names != (NO_SHIFT,), self.chunk > 0
         units = None if unit_episodes is None else frozenset(parse_numbers(unit_episodes))
-        check_arguments(self._arguments, self._shifts.names)
         step = (
             StoredSelector(retrieval, rule=retrieval_rule, camera=retrieval_camera)
             if retrieval
             else None
         )
-        datasets = needed_datasets(
+        actions = self.chunk > 0
+        self._rows = open_rows(
             self.buffer_set,
             self._conditions.names,
+            self.cameras,
+            image_size=image_size,
+            other_states=other_states,
+            cache=cache,
             actions=actions,
-            shifts=shifted,
+            shifts=shift_weights.names != (NO_SHIFT,),
             planned=not redraw,
         )
-        self.buffer_set.check_tables(self._conditions.names, planned=not redraw)
-        for dataset in datasets.values():
-            dataset.check_records()
-        kept = open_cache(cache)
-        if kept is None:
-            raise InvalidOptionError.expected("cache", cache, "True, a folder or a DecodedCache")
-        size = check_size(self.buffer_set, self.cameras, image_size)
-        rule, others = check_rule(other_states), dict[str, int]()
-        if any(parse_condition(name).k for name in self._conditions.names):
-            others = other_state_sizes(datasets)
-        what = f"HistoryDataset of {self.buffer_set.name}"
-        check_sizes(what, query_state_size(datasets), others, rule)
-        self._rows = StoredRows(datasets, kept, size, rule)
         self._moments = choose_moments(
             self.buffer_set, self._rows, split, families, episodes, actions=actions
         )
-        draws = (seed, units) if redraw else None
-        self._histories = Histories(self.buffer_set, self._rows, step, draws)
+        self._histories = Histories(
+            self.buffer_set, self._rows, step, (seed, units) if redraw else None
+        )
         self._questions = QuestionTensors(self.buffer_set, self.episode_ids) if questions else None
-        now = self._live_rows()
-        if redraw:
-            history = drawable_rows(datasets, self._rows, self.episode_ids, units)
-        else:
-            with WorkProgress(quiet=quiet) as progress, progress.status("Laying out histories"):
-                self._histories.plan(
-                    self._conditions.names, self.episode_ids, self._shift_of.values()
-                )
-            history = self._histories.rows
+        self._draws = ItemDraws(
+            self.buffer_set,
+            self._rows,
+            self._moments,
+            self._histories,
+            self._conditions,
+            shift_weights,
+            seed,
+        )
+        if not redraw:
+            self._histories.plan(
+                self._conditions.names, self.episode_ids, self._draws.shifts.values(), quiet=quiet
+            )
         # Here, not when they are first used: a loader's forked workers share what is open now.
-        self._used = np.concatenate([now, history])
+        now = self._draws.live_rows
+        self._used = np.concatenate([now, self._histories.rows_in_use(self.episode_ids)])
         self._rows.prepare((*self.cameras, STATE), self._used, quiet=quiet)
         if actions:
             self._rows.prepare((ACTION,), now, quiet=quiet)
@@ -224,7 +213,7 @@ class HistoryDataset:
             self.memory_frames,
             self._histories.parts,
         )
-        several = len(self._conditions.names) > 1 or len(self._shifts.names) > 1
+        several = len(self._conditions.names) > 1 or len(shift_weights.names) > 1
         self._epoch = Epoch(len(self), draws=redraw or several)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -391,7 +380,8 @@ class HistoryDataset:
         if indices.ndim != 1 or indices.dtype.kind not in "iu" or not len(indices):
             given = f"indices of type {indices.dtype} and shape {indices.shape}"
             raise IndexError(f"{given}; expected one integer or several")
-        items = [self._drawn(index) for index in indices.tolist()]
+        epoch = self.epoch
+        items = [self._draws.draw(epoch, index) for index in indices.tolist()]
         numbers = [drawn.number for drawn in items]
         episodes = [self.episode_ids[number] for number in numbers]
         arrays = self._batches.arrays(items)
@@ -406,30 +396,6 @@ class HistoryDataset:
             texts |= self._questions.texts(numbers)
         batch = {name: torch.from_numpy(values) for name, values in arrays.items()} | texts
         if self._image_transforms is not None:
-            keys = [(self.seed, self.epoch, drawn.item) for drawn in items]
+            keys = [(self.seed, epoch, drawn.index) for drawn in items]
             transform_images(batch, self.cameras, self._image_transforms, keys)
         return renamed(batch) if self.layout == "lerobot" else batch
-
-    def _drawn(self, index: int) -> Drawn:
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"index {index} of {len(self)} items")
-        index %= len(self)
-        epoch, (number, moment) = self.epoch, self._moments.locate(index)
-        condition = self._conditions.draw("condition", self.seed, epoch, index)
-        shift = self._shifts.draw("shift", self.seed, epoch, index)
-        drawn = self._shift_of[shift]
-        history = self._histories.get(epoch, self.episode_ids[number], condition, drawn)
-        now = self._view_row(number, drawn) + moment
-        return Drawn(index, number, moment, condition, shift, history, now)
-
-    def _view_row(self, number: int, shift: Shift | None) -> int:
-        """Return the row of the first live view of an episode, given by its number."""
-        if shift is None:
-            return int(self._moments.first[number])
-        _, stored, frame = shifted_view(self.buffer_set, self.episode_ids[number], shift)
-        return self._rows.first(SHIFTED, stored) + frame
-
-    def _live_rows(self) -> NDArray[np.int64]:
-        """Return the rows of the first live views; those of later ones belong to the same spans."""
-        numbers, shifts = range(len(self.episode_ids)), self._shift_of.values()
-        return np.array([self._view_row(number, shift) for shift in shifts for number in numbers])
