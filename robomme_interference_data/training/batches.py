@@ -60,7 +60,7 @@ class Batches:
             batch[ACTION] = self._rows.take(ACTION, first + np.minimum(steps, last))
             batch["action_is_pad"] = steps > last
         batch["frame_index"] = moment
-        batch["index"] = np.array([drawn.index for drawn in items])
+        batch["index"] = np.array([drawn.item for drawn in items])
         return batch
 
     def _in_memory(self, items: Sequence[DrawnItem]) -> tuple[NDArray[np.int64], dict[str, Any]]:

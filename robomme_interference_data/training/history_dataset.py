@@ -29,8 +29,7 @@ from .epoch import Epoch
 from .histories import Histories
 from .image_transforms import transform_images
 from .item_draws import ItemDraws
-from .layout import renamed
-from .lerobot.meta import LeRobotMeta, describe
+from .layout import LeRobotMeta, describe, renamed
 from .loaders import Items, item_of, made_or_unusable
 from .moments import choose_moments
 from .opening import check_arguments, open_rows
@@ -396,6 +395,6 @@ class HistoryDataset:
             texts |= self._questions.texts(numbers)
         batch = {name: torch.from_numpy(values) for name, values in arrays.items()} | texts
         if self._image_transforms is not None:
-            keys = [(self.seed, epoch, drawn.index) for drawn in items]
+            keys = [(self.seed, epoch, drawn.item) for drawn in items]
             transform_images(batch, self.cameras, self._image_transforms, keys)
         return renamed(batch) if self.layout == "lerobot" else batch

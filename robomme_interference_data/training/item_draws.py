@@ -19,7 +19,7 @@ from .rows import StoredRows
 class DrawnItem(NamedTuple):
     """A moment of an episode, with its condition, its history and its current frame."""
 
-    index: int
+    item: int  # its index
     number: int  # of the episode
     moment: int
     condition: str
