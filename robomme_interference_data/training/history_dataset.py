@@ -48,7 +48,8 @@ class HistoryDataset:
     follows from `seed`, the epoch and the index: items are the same for any number of workers and
     ranks, in any order. Frames come from the cache of decoded frames, which the first use fills.
 
-    An item has, with M memory frames, S the image size and P the most parts of an answer:
+    An item has, with M memory frames, images of S × S pixels (or the recorded height and width),
+    states of D values, actions of A, and P the most parts of an answer:
 
     - `observation.images.<camera>`: `(3, S, S) uint8` RGB, the current frame;
     - `observation.state`: `(D,) float32`: 7 joint positions in rad, opening of a finger in m;
@@ -59,7 +60,7 @@ class HistoryDataset:
     - `memory.evidence`: `(M, P) bool`, which parts of the hidden answer each frame shows; and
       `evidence_known`: `() bool`, False where that is unknown;
     - `position`: `() int64`, index of the current frame in history and execution together;
-    - `action`: `(chunk, D) float32`, the actions executed from the current frame on, and
+    - `action`: `(chunk, A) float32`, the actions executed from the current frame on, and
       `action_is_pad`: `(chunk,) bool`, True after the last one, which is repeated;
     - with `questions`, for O options with at most P points: `question` and
       `question.options` (O texts, `""` where only the points show it), `question.points`:
@@ -87,8 +88,8 @@ class HistoryDataset:
         episodes: Indices of the query episodes to use, such as `0-79`; None for all.
         retrieval: Encoder of a retrieval step before the memory, such as `thumbnail`; its index
             must be stored. `retrieval_rule` and `retrieval_camera` are those of `evaluate`.
-        shifts: Shifts of the first live view, with weights; needs the dataset `shifted` and
-            `chunk=0`, since only first views are stored.
+        shifts: Shifts of the first live observation, with weights; needs the dataset `shifted`
+            and `chunk=0`, since only first observations are stored.
         questions: Whether items have the question about the past, see `build --only questions`.
         redraw: Draw the sessions of the conditions anew in every epoch, instead of the planned
             ones. Then conditions need not be planned.
@@ -220,22 +221,38 @@ class HistoryDataset:
         # may have another working directory.
         files = self.buffer_set.files
         location = str(files.root.absolute()) if isinstance(files, LocalFiles) else files.location
-        made = (HistoryDataset._opened_again, location, self._arguments, self._epoch, self.content)
-        return made_or_unusable, made
+        arguments = (location, self._arguments, self._epoch, self._identity)
+        return made_or_unusable, (HistoryDataset._opened_again, *arguments)
 
     @classmethod
     def _opened_again(
-        cls, location: str, arguments: dict[str, Any], epoch: Epoch, content: str
+        cls, location: str, arguments: dict[str, Any], epoch: Epoch, identity: str
     ) -> "HistoryDataset":
         made = cls(location, **arguments, quiet=True)
         # Items are numbered over all episodes: in a set that grew, an index means another moment.
-        if made.content != content:
+        if made._identity != identity:
             raise HashMismatchError(
                 f"{location} was changed since the training began: a worker finds other items",
                 "Start the training again; do not change a buffer set that is in use.",
             )
         made._epoch = epoch
         return made
+
+    @property
+    def _identity(self) -> str:
+        """Digest of header, episodes, and rows of the planned histories.
+
+        If another process that opens the buffer set again finds the same, an index means the same
+        item there.
+        """
+        rows = [self._moments.first, self._histories.rows]
+        return digest_json(
+            [
+                to_dict(self.buffer_set.header),
+                [str(episode) for episode in self.episode_ids],
+                *(hashlib.sha256(numbers.tobytes()).hexdigest() for numbers in rows),
+            ]
+        )
 
     def __len__(self) -> int:
         """Return the number of items."""
@@ -259,22 +276,6 @@ class HistoryDataset:
             return self.memory.frames - 1
         longest = self._histories.longest(self._conditions.names, self.episode_ids)
         return longest + self._moments.most - 1
-
-    @cached_property
-    def content(self) -> str:
-        """Digest of what the items are of: header, episodes, and rows of the planned histories.
-
-        In another process that opened the same buffer set again, an index means the same item if
-        this is the same.
-        """
-        rows = [self._moments.first, self._histories.rows]
-        return digest_json(
-            [
-                to_dict(self.buffer_set.header),
-                [str(episode) for episode in self.episode_ids],
-                *(hashlib.sha256(one.tobytes()).hexdigest() for one in rows),
-            ]
-        )
 
     def stored_values(self, feature: str, most: int | None = None) -> NDArray[Any]:
         """Return the values of a feature in all sessions and executions in use, `(N, …)`.

@@ -49,18 +49,22 @@ class Moments:
     def locate(self, index: int) -> tuple[int, int]:
         """Return the number of the episode of an item, and the moment."""
         number = int(np.searchsorted(self.stops, index, "right"))
-        return number, index - (int(self.stops[number - 1]) if number else 0)
+        return number, index - self._start(number)
 
     def index_of(self, episode: EpisodeId, moment: int) -> int:
         """Return the index of the item of an episode's moment."""
         if episode not in self.episodes:
             raise UnknownNameError.among("episode", str(episode), "the items", self.episodes)
         number = self.episodes.index(episode)
-        first = int(self.stops[number - 1]) if number else 0
-        if not 0 <= moment < self.stops[number] - first:
-            last = int(self.stops[number]) - first - 1
-            raise UnknownNameError(f"{episode} has the moments 0 to {last}; got {moment}")
-        return first + moment
+        start = self._start(number)
+        count = int(self.stops[number]) - start
+        if not 0 <= moment < count:
+            raise UnknownNameError(f"{episode} has the moments 0 to {count - 1}; got {moment}")
+        return start + moment
+
+    def _start(self, number: int) -> int:
+        """Return the index of the first item of an episode."""
+        return int(self.stops[number - 1]) if number else 0
 
 
 def choose_moments(
@@ -72,20 +76,21 @@ def choose_moments(
     *,
     actions: bool,
 ) -> Moments:
-    """Return the moments of executions, or the first live views where actions are not needed."""
-    there = {episode.split for episode in buffer_set.episode_ids}
-    if split not in there:
-        names = " or ".join(repr(name) for name in SPLITS if name in there)
-        raise InvalidOptionError.expected(
-            "split",
-            split,
-            f"{names}: {buffer_set.location} has no other episodes",
-            "Train on train episodes only; for others, give their split.",
-        )
-    known = buffer_set.families
-    for family in families:
-        if family not in known:
-            raise UnknownNameError.among("family", family, buffer_set.location, known)
+    """Return the moments of executions, or the first ones alone if actions are not needed.
+
+    Args:
+        buffer_set: The buffer set.
+        rows: The rows of its datasets.
+        split: Split of the episodes.
+        families: Families of the episodes; empty for all.
+        episodes: Indices of the episodes, such as `0-79`; None for all.
+        actions: Whether each moment needs an action.
+
+    Raises:
+        InvalidOptionError: There are no such episodes, or not all of them.
+        UnknownNameError: There is no such family.
+    """
+    _check_names(buffer_set, split, families)
     numbers = None if episodes is None else frozenset(parse_numbers(episodes))
     live = buffer_set.datasets[EXECUTIONS if actions else DEMONSTRATIONS]
     recorded = {
@@ -97,7 +102,7 @@ def choose_moments(
         episode
         for episode in buffer_set.episode_ids
         if episode.split == split
-        and episode.family in (families or known)
+        and episode.family in (families or buffer_set.families)
         and (numbers is None or episode.index in numbers)
         and episode in recorded
     )
@@ -114,3 +119,20 @@ def choose_moments(
         for record in records
     ]
     return Moments(chosen, np.array(first), counts, np.cumsum(np.maximum(counts, 1)))
+
+
+def _check_names(buffer_set: BufferSet, split: str, families: Sequence[str]) -> None:
+    """Check that there are episodes of a split and of families."""
+    splits = {episode.split for episode in buffer_set.episode_ids}
+    if split not in splits:
+        names = " or ".join(repr(name) for name in SPLITS if name in splits)
+        raise InvalidOptionError.expected(
+            "split",
+            split,
+            f"{names}: {buffer_set.location} has no other episodes",
+            "Train on train episodes only; for others, give their split.",
+        )
+    known = buffer_set.families
+    for family in families:
+        if family not in known:
+            raise UnknownNameError.among("family", family, buffer_set.location, known)
