@@ -162,7 +162,7 @@ def _intervals(
     alike = defaultdict[bytes, list[str]](list)
     for system in fall_of:
         alike[outcomes.has_episode[outcomes.systems.index(system)].tobytes()].append(system)
-    intervals = {}
+    intervals: dict[str, Interval] = {}
     for systems in alike.values():
         here = outcomes.has_episode[outcomes.systems.index(systems[0])]
         slopes = np.stack([fall_of[system].slopes[here] for system in systems], axis=1)

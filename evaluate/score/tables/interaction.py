@@ -165,11 +165,11 @@ def _apart(outcomes: Outcomes, falls: _FallsOf, system: str, other: str) -> _Apa
         both = [shared_runs([*side], training) for side in (first, second)]
     if not all(runs.any() for runs in both):
         return None
-    fallen = [
+    of_other, of_system = (
         falls(name, tuple(conditions), tuple(runs.tolist()))
         for name, runs in zip((other, system), both, strict=True)
-    ]
-    return _Apart(system, other, conditions, *fallen, related)
+    )
+    return _Apart(system, other, conditions, of_other, of_system, related)
 
 
 def _interactions(outcomes: Outcomes, draws: int) -> list[Contrast]:
