@@ -37,6 +37,11 @@ SPLITS = ("train", "val", "test", HELDOUT)
 
 DIFFICULTIES = ("easy", "medium", "hard")
 
+ABILITIES = ("recall", "several", "update", "order-first", "order-last", "absent")
+"""What a query of a day needs of a memory, in the order of tables: one lesson; two halves of a
+lesson, apart from each other; the newer one of two lessons with different answers; the first or the
+last of two, as the goal says; to know that there was no lesson."""
+
 MAX_K = 63
 """Most sessions that a condition adds to the lesson (ours; the paper uses up to 7)."""
 

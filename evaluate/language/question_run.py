@@ -159,8 +159,8 @@ def _check_settings(config: AskConfig) -> None:
         check_unused(config, unused, config.model, "Leave it out, or ask a model.")
     elif ":" not in config.model:
         raise UnknownNameError(
-            f"there is no model {config.model!r}; expected recall, guess, openai:URL#MODEL, "
-            "transformers:ID or transformers:FOLDER",
+            f"there is no model {config.model!r}; expected recall, abstain, guess, "
+            "openai:URL#MODEL, transformers:ID or transformers:FOLDER",
             nearest(config.model, WITHOUT_MODEL, more=""),
         )
     else:

@@ -211,7 +211,7 @@ class AskConfig(WorkConfig):
     model: str = setting(
         group=_MODEL,
         help="openai:URL#MODEL, transformers:ID or transformers:FOLDER; recall (the ideal "
-        "observer) or guess.",
+        "observer), guess, or in days abstain (it was not shown).",
     )
     buffer_set: str = setting(
         name="-",

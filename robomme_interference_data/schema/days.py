@@ -39,11 +39,6 @@ TASKS = range(8, 61)
 
 DEFAULT_TASKS = 30
 
-ABILITIES = ("recall", "several", "update", "order-first", "order-last", "absent")
-"""What a query of a day needs of a memory, in the order of tables: one lesson; two halves of a
-lesson, apart from each other; the newer one of two lessons with different answers; the first or the
-last of two, as the goal says; to know that there was no lesson."""
-
 _CYCLE = ("recall", "update", "order", "absent", "recall", "update")
 _CYCLE_IN_PIECES = ("several", "recall", "update", "absent", "several", "order")
 _IN_PIECES = ("VideoPlaceOrder", "VideoPlaceButton", "PatternLock", "RouteStick")
