@@ -1,6 +1,7 @@
 """Days in a buffer set: what is stored, which buffers are spans of it, and what `verify` finds.
 
-On days of a simulator without physics; `test_days_played.py` builds one on the embedded simulator.
+On days of a simulator without physics; `docs/how-to/days.md` builds one on the embedded simulator,
+which `system/test_how_to.py` runs.
 """
 
 import hashlib

@@ -38,14 +38,7 @@ DATASETS = ("demonstrations", "distractors", "days")
 NUMBERS = (0, 2)
 """Of the days: one of them looks different at first, and shows a lesson in pieces."""
 
-CONDITIONS = (
-    "no-history",
-    "day-k0",
-    "day-k2",
-    "day-cut-k0",
-    "day-cut-k2",
-    "day-alone",
-)
+CONDITIONS = ("no-history", "day-k0", "day-k2", "day-cut-k0", "day-cut-k2", "day-alone")
 LESSON, CUT, IDLE, SIZE = 6, 3, 4, 32
 """Frames of a lesson, of its first piece, of idle time; pixels."""
 
@@ -67,9 +60,7 @@ class DayDouble(Double):
     def _begin(self, episode: EpisodeId, frame_step: int) -> EpisodeStart:
         images = {name: lesson(episode)[:: frame_step or 1] for name in self.cameras}
         states = np.arange(LESSON, dtype=np.float32)[:, None].repeat(8, 1)
-        evidence = tuple(
-            EvidenceSpan(part, f"part {part}", *span) for part, span in _SHOWN.items()
-        )
+        evidence = tuple(EvidenceSpan(part, f"part {part}", *span) for part, span in _SHOWN.items())
         shown = Demonstration(images, states, np.ones((LESSON, 8), np.float32), evidence)
         info = EpisodeInfo(("goal",), "easy", episode.index, self.name)
         return shown, Observation(self._images(episode), np.full(8, 10, np.float32)), info
