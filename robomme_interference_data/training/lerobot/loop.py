@@ -7,6 +7,7 @@ options, processors, optimizers, checkpoints, resuming, several processes, evalu
 are held out, and pushing to the Hub.
 """
 
+import errno
 import io
 import json
 import math
@@ -141,8 +142,9 @@ def make_datasets(config: TrainingConfig) -> tuple[HistoryDataset, Any]:
     buffer_set = load_buffer_set(data.root or f"{data.repo_id}@{data.revision}")
     if data.content not in ("", buffer_set.revision):
         raise HashMismatchError(
-            f"{buffer_set.location} was changed since the training began",
-            "Start a new training, or restore the buffer set.",
+            f"{buffer_set.location} has other content than the buffer set with which the training "
+            "began",
+            "Start a new training, or give or restore that buffer set.",
         )
     data.content = buffer_set.revision
     data.conditions = data.conditions or dict.fromkeys(buffer_set.conditions, 1.0)
@@ -285,7 +287,7 @@ def train(arguments: Sequence[str]) -> None:
             # Without the parser of LeRobot's own settings around it.
             lerobot_train.train.__wrapped__(settings)
         except SafetensorError as error:  # such as on a full disk
-            raise OSError(f"a checkpoint cannot be written: {error}") from error
+            raise OSError(errno.EIO, f"a checkpoint cannot be written: {error}") from error
     finally:
         (lerobot_train.make_train_eval_datasets, lerobot_train.EpisodeAwareSampler, sys.argv) = (
             replaced
