@@ -33,6 +33,7 @@ from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import HashMismatchError, InvalidOptionError, first_line
 from robomme_interference_data.ids import format_numbers, parse_numbers
+from robomme_interference_data.schema.memory_features import declares_memory
 from robomme_interference_data.schema.sampling import spread
 from robomme_interference_data.storage.files import LocalFiles
 from robomme_interference_data.training.draws import number_from
@@ -101,7 +102,7 @@ def memory_of_policy(config: Any) -> tuple[str, int | None]:
     Raises:
         InvalidOptionError: It declares none.
     """
-    if not (hasattr(config, "memory") and hasattr(config, "image_size")):
+    if not declares_memory(config):
         name = config.type if isinstance(config, PreTrainedConfig) else "of a reward model"
         raise InvalidOptionError(
             f"the policy type {name} has no memory: its configuration lacks the fields `memory` "
