@@ -78,7 +78,7 @@ class BuildConfig(FittingWorkersConfig):
         whole=True,
         metavar="SOURCE",
         help="robomme-h5:FOLDER, lerobot:FOLDER, lerobot:NAMESPACE/NAME[/FOLDER][@REVISION], "
-        "frames:FOLDER, tabletop, robomme, MODULE:CLASS of your simulator "
+        "frames:FOLDER, tabletop, tabletop-day[:TASKS], robomme, MODULE:CLASS of your simulator "
         "or sample[:FAMILY,…]; repeat for several.",
     )
     parts: tuple[str, ...] = setting(
@@ -113,8 +113,8 @@ class BuildConfig(FittingWorkersConfig):
     )
     episodes: str | None = setting(
         None,
-        help="Indices of the query episodes, such as 0-49 or 0,3,10-12; default: all, of "
-        "tabletop's 900 train episodes a family 0-99.",
+        help="Indices of the query episodes, such as 0-49 or 0,3,10-12; of tabletop-day the "
+        "numbers of the days; default: all, of tabletop's 900 train episodes a family 0-99.",
         group="Episodes",
     )
     shard: str = setting(

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 from robomme_interference_data.constants import DEMONSTRATIONS, MANIFEST_PATH, QUESTIONS_PATH
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.query import Query
-from robomme_interference_data.data.questions import Question
+from robomme_interference_data.data.questions import NOT_SHOWN, Question
 from robomme_interference_data.errors import BuildError
 from robomme_interference_data.lazy import load_extra
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
@@ -26,9 +26,11 @@ from robomme_interference_data.storage.video.encode import png
 _MOST, _DRAWN = 5, 4
 """Most options of a question; if the scene has more answers, the number that is drawn."""
 
+_NOT_SHOWN_WORDS = "it was not shown"
+
 Marks = Sequence[Sequence[Pixel]]
-"""The points of each option, (y, x) in pixels of the first live observation; none if words describe
-it."""
+"""The points of each option of the scene, (y, x) in pixels of the first live observation; none if
+words describe it."""
 
 
 def make_questions(buffer_set: BufferSet) -> Iterator[Question]:
@@ -45,7 +47,8 @@ def make_questions(buffer_set: BufferSet) -> Iterator[Question]:
                 f"the first live observation of {question.episode_id} has "
                 f"{view.shape[1]}×{view.shape[0]} pixels; expected {side}×{side}, in which the "
                 "positions of objects are known",
-                "Build the demonstrations with the simulator itself.",
+                "Build the demonstrations with the simulator itself and without `resize`; training "
+                "resizes frames by itself (`image_size`).",
             )
         yield replace(question, picture=png(picture(view, marks)))
 
@@ -99,14 +102,25 @@ def _planned(query: Query, revision: str) -> tuple[Question, Marks]:
     chosen = sorted([right, *others], key=lambda choice: _lot(name, "order", choice))
     options = [scene.option(choice) for choice in chosen]
     marks = [scene.pixels(option.marks) for option in options]
+    words = [option.words for option in options]
+    answers = [numbers[choice] for choice in chosen]
+    correct = chosen.index(right)
+    points = [" ".join(f"{y},{x}" for y, x in marked) for marked in marks]
+    if query.record.ability is not None:
+        # The picture cannot show this option, so it has no marks.
+        words.append(_NOT_SHOWN_WORDS)
+        answers.append(NOT_SHOWN)
+        points.append("")
+        if query.record.ability == "absent":
+            correct = len(answers) - 1
     question = Question(
         query.episode_id,
         revision,
         scene.question,
-        tuple(option.words for option in options),
-        tuple(numbers[choice] for choice in chosen),
-        chosen.index(right),
-        tuple(" ".join(f"{y},{x}" for y, x in points) for points in marks),
+        tuple(words),
+        tuple(answers),
+        correct,
+        tuple(points),
         picture=b"",
     )
     return question, marks

@@ -7,6 +7,7 @@ from typing import Any
 
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
+    DAYS,
     DEMONSTRATIONS,
     DISTRACTORS,
     EXECUTIONS,
@@ -49,6 +50,7 @@ _FOLDERS = {
     CONTRADICTIONS: "lessons in the scenes of the queries with other answers",
     SHIFTED: "the first live observations under shifts of light, camera and clutter",
     EXECUTIONS: "what follows each lesson: live frames, states and actions",
+    DAYS: "recordings of a robot's days, many tasks without a cut",
 }
 
 

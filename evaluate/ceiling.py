@@ -111,15 +111,22 @@ def _kept(buffer: Buffer, memory: Memory, received: Sequence[int], frames: int) 
     if buffer.evidence is None:
         return None, None
     kept = memory.kept(received)
-    success = chance(buffer.query, known_parts(buffer.evidence, kept, frames))
+    first_counts = buffer.query.first_counts
+    known = known_parts(buffer.evidence, kept, frames, first_counts=first_counts)
+    success = chance(buffer.query, known)
     return evidence_kept(buffer.evidence, kept), success
 
 
 def chance(query: Query, known: dict[int, str]) -> float | None:
-    """Return the chance of a draw among the answers that agree with what is known to be right."""
+    """Return the chance of a draw among the answers that agree with what is known to be right.
+
+    In a day, where some queries have no lesson, an observer that knows nothing does nothing.
+    """
     spans, scene = query.record.evidence, recorded_scene(query)
     if spans is None or scene is None:
         return None
+    if query.record.ability is not None and (not known or query.record.ability == "absent"):
+        return float(query.record.ability == "absent" and not known)
     # All parts together leave one answer.
     [right] = scene.agreeing({span.part: span.text for span in spans})
     agreeing = scene.agreeing(known)

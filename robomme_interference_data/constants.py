@@ -37,6 +37,11 @@ SPLITS = ("train", "val", "test", HELDOUT)
 
 DIFFICULTIES = ("easy", "medium", "hard")
 
+ABILITIES = ("recall", "several", "update", "order-first", "order-last", "absent")
+"""What a query of a day needs of a memory, in the order of tables: one lesson; two halves of a
+lesson, apart from each other; the newer one of two lessons with different answers; the first or the
+last of two, as the goal says; to know that there was no lesson."""
+
 MAX_K = 63
 """Most sessions that a condition adds to the lesson (ours; the paper uses up to 7)."""
 
@@ -119,6 +124,9 @@ SHIFTED = "shifted"
 EXECUTIONS = "executions"
 """Recordings of the queries from the first live observation on, with actions."""
 
+DAYS = "days"
+"""Recordings of a robot's days: many tasks, without a cut."""
+
 LESSONS = (DEMONSTRATIONS, CONTRADICTIONS)
 """Datasets of lessons followed by their first live observation."""
 
@@ -165,7 +173,7 @@ PAPER_UNIT = Unit(UNIT_FRAMES, UNIT_STRIDE)
 UNITS = (DISTRACTORS, RAW_DISTRACTORS)
 """Datasets of units."""
 
-OPTIONAL_DATASETS = (RAW_DISTRACTORS, CONTRADICTIONS, SHIFTED, EXECUTIONS)
+OPTIONAL_DATASETS = (RAW_DISTRACTORS, CONTRADICTIONS, SHIFTED, EXECUTIONS, DAYS)
 """Datasets that a buffer set may lack; on the Hub, folders of its repository."""
 
 DATASETS = (DEMONSTRATIONS, DISTRACTORS, *OPTIONAL_DATASETS)

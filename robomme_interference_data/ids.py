@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Self
 
-from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, SPLITS
+from robomme_interference_data.constants import ABILITIES, DIFFICULTIES, FAMILIES, SPLITS
 from robomme_interference_data.errors import InvalidIdError, InvalidOptionError, nearest
 
 _FAMILY = re.compile(r"[A-Za-z][A-Za-z0-9_.-]*")
@@ -15,7 +15,7 @@ _START = re.compile(r"[1-9][0-9]{0,17}")
 _SPAN = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
 _MAX_NUMBERS = 1_000_000
 _FAMILY_RANK = {family: rank for rank, family in enumerate(FAMILIES)}
-_RESERVED = (*DIFFICULTIES, "all")
+_RESERVED = (*DIFFICULTIES, *ABILITIES, "all")
 """What tables call other parts of the episodes."""
 
 
@@ -36,8 +36,8 @@ class EpisodeId:
     order of all stored data.
 
     Args:
-        family: Task family: a letter, then letters, digits, `_`, `.` or `-`; not `all` or a
-            difficulty.
+        family: Task family: a letter, then letters, digits, `_`, `.` or `-`; not `all`, a
+            difficulty or an ability.
         split: `train`, `val`, `test` or `heldout`.
         index: Number of the episode within family and split, from 0.
         answer: Number of the played answer, from 0; None for the scene's correct answer.

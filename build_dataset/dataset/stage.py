@@ -24,7 +24,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import Worker
-from robomme_interference_data.schema.records import EpisodeRecord, SpanDigests, lesson_spans
+from robomme_interference_data.schema.records import Day, EpisodeRecord, SpanDigests, lesson_spans
 from robomme_interference_data.simulators.registry import simulator_renderer, simulator_versions
 from robomme_interference_data.storage.arrays import (
     FeatureDigests,
@@ -73,7 +73,9 @@ class StageTask:
                 ):
                     with tempfile.TemporaryDirectory(dir=worker.folder) as name:
                         folder, stored = Path(name), replace(episode.id, start=start)
-                        episodes.append(self._write(stored, recording, frames, folder))
+                        made = self._write(stored, recording, frames, folder)
+                        record = replace(made.record, ability=episode.ability)
+                        episodes.append(replace(made, record=record))
                         for path in sorted(folder.iterdir()):
                             worker.send_file(staged_file(start, path.name), path.read_bytes())
         except NothingToStore as reason:
@@ -130,8 +132,15 @@ class StageTask:
         writer.close()
         start = writer.length - 1 if self.plan.kind in LESSONS else None
         spans = {} if start is None else lesson_spans(start)
+        day = None if recording.day is None else recording.day()
+        tasks = () if day is None else day.spans
         whole, session, *parts = writer.decode(
-            [(0, writer.length), (0, writer.length if start is None else start), *spans.values()]
+            [
+                (0, writer.length),
+                (0, writer.length if start is None else start),
+                *spans.values(),
+                *((span.start, span.stop) for span in tasks),
+            ]
         )
         if codec.exact and whole != writer.digests.current():
             raise BuildError(
@@ -151,9 +160,10 @@ class StageTask:
             exec_start_idx=start,
             exact=recording.exact and codec.exact and not writer.resized,
             feature_sha256=session,
-            span_sha256=SpanDigests(*map(combine, parts)) if parts else None,
+            span_sha256=SpanDigests(*map(combine, parts)) if spans else None,
             evidence=None if start is None else recording.evidence,
             scene=None if start is None else recording.scene,
+            day=None if day is None else _with_digests(day, parts),
         )
         stats = {
             feature: {name: tuple(map(float, values)) for name, values in images.result().items()}
@@ -162,6 +172,14 @@ class StageTask:
         recording.robot.check_names(writer.features)
         robot = replace(recording.robot, fps=fps)
         return StagedEpisode(record, writer.features, stats, robot)
+
+
+def _with_digests(day: Day, parts: Sequence[dict[str, str]]) -> Day:
+    """Return a day with the digests of its spans."""
+    spans = (
+        replace(span, sha256=combine(part)) for span, part in zip(day.spans, parts, strict=True)
+    )
+    return replace(day, spans=tuple(spans))
 
 
 class _Writer:

@@ -81,8 +81,12 @@ def check_plans(
     root: Path,
     planned: PlannedBuffers | None,
     request: BuffersConfig,
+    absent: Collection[EpisodeId] = (),
 ) -> NextBuffers:
-    """Check that datasets can be built or extended, and that units suffice; return the buffers."""
+    """Check that datasets can be built or extended, and that units suffice; return the buffers.
+
+    `absent` are the query episodes whose lesson is never shown.
+    """
     existing = {kind: open_existing(root.resolve() / kind, plan) for kind, plan in plans.items()}
     demonstrations = existing.get(DEMONSTRATIONS)
     if demonstrations is not None:
@@ -95,16 +99,19 @@ def check_plans(
     available = {replace(unit.episode.id, start=n) for unit in units.episodes for n in range(most)}
     if built is not None:
         available |= built.ids
-    _check_units(available, queries, following)
+    _check_units(available, queries, following, absent)
     check_manifests_folder(root)
     return following
 
 
 def _check_units(
-    available: Collection[EpisodeId], queries: Collection[EpisodeId], following: NextBuffers
+    available: Collection[EpisodeId],
+    queries: Collection[EpisodeId],
+    following: NextBuffers,
+    absent: Collection[EpisodeId],
 ) -> None:
     try:
-        check_units(UnitPool(available), queries, following.conditions)
+        check_units(UnitPool(available), queries, following.conditions, absent)
     except BuildError as error:
         splits = {query.split for query in queries}
         if not {"train", "test"} <= splits:

@@ -17,6 +17,7 @@ from robomme_interference_data.build_dataset.dataset.resize import Resize
 from robomme_interference_data.build_dataset.sources import Source, open_source, takes
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
+    DAYS,
     EXECUTIONS,
     LESSONS,
     SHIFTED,
@@ -46,7 +47,7 @@ def plan_dataset(
     sources = open_sources(kind, config, unit)
     episodes = choose_episodes(
         sources,
-        families=config.families,
+        families=() if kind == DAYS else config.families,  # of the queries
         split=split,
         numbers=None if config.episodes is None else parse_numbers(config.episodes),
         queries=queries,
@@ -133,6 +134,7 @@ def open_sources(kind: str, config: BuildConfig, unit: Unit) -> tuple[Source, ..
     return tuple(
         open_source(
             text,
+            kind=kind,
             shifted=kind == SHIFTED,
             columns=columns,
             families_from=config.families_from,

@@ -28,8 +28,8 @@ def choose_episodes(
         sources: The sources.
         families: Families; empty for all.
         split: `train`, `val`, `test` or `heldout`; None for all.
-        numbers: Indices of episodes in their split; None for all but those that a source lists as
-            further ones.
+        numbers: Indices of episodes in their split, of a day's queries that of the day; None for
+            all but those that a source lists as further ones.
         queries: These episodes alone, whatever the other filters are; None to filter.
 
     Raises:
@@ -95,7 +95,9 @@ def in_selection(episode: SourceEpisode, split: str | None, indices: Container[i
     """
     if split not in (None, episode.id.split):
         return False
-    return not episode.further if indices is None else episode.id.index in indices
+    if indices is None:
+        return not episode.further
+    return (episode.id.index if episode.number is None else episode.number) in indices
 
 
 def _described(episodes: Iterable[EpisodeId]) -> str:

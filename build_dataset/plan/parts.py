@@ -21,6 +21,7 @@ from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
 from robomme_interference_data.build_dataset.manifest_checks import check_needs
 from robomme_interference_data.constants import (
     DATASETS,
+    DAYS,
     DEMONSTRATIONS,
     DISTRACTORS,
     MANIFEST_PATH,
@@ -30,6 +31,7 @@ from robomme_interference_data.constants import (
 )
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.errors import BuildError, InvalidOptionError, named
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.runtime.executor import WorkersConfig
 from robomme_interference_data.schema.conditions import datasets_of
 from robomme_interference_data.schema.settings import changed_settings
@@ -155,12 +157,13 @@ def _plan_whole(config: BuildConfig, request: BuffersConfig) -> BuildPlan:
     further = [name for name in config.parts if name in DATASETS and name not in needed]
     if base is None:
         names = [*needed, *further]
-        queries = set()
+        queries = absent = set[EpisodeId]()
     else:
         # The sources are those of the units: what needs the scenes of the demonstrations is built
         # by its name.
         names = [name for name in needed if name in UNITS] + further
         queries = {record.episode_id for record in base.records()}
+        absent = {record.episode_id for record in base.records() if record.ability == "absent"}
         available = {*datasets_in(root), *names}
         check_needs(next_buffers(planned, request).conditions, available, root)
     units = _settings_of_units(config, alone=base is not None)
@@ -176,7 +179,12 @@ def _plan_whole(config: BuildConfig, request: BuffersConfig) -> BuildPlan:
             plans[name] = plans[name].matching(base)
     if base is None:
         queries = {query.episode.id for query in plans[DEMONSTRATIONS].episodes}
-    change = check_plans(queries, plans, root, planned, request)
+        absent = {
+            query.episode.id
+            for query in plans[DEMONSTRATIONS].episodes
+            if query.episode.ability == "absent"
+        }
+    change = check_plans(queries, plans, root, planned, request, absent)
     return BuildPlan(plans, change, True, QUESTIONS in config.parts, base)
 
 
@@ -216,7 +224,7 @@ def plan_alone(kind: str, config: BuildConfig) -> DatasetPlan:
     base = Dataset(LocalFiles(folder))
     config = _with_cameras_of(base, config)
     queries = None
-    if kind not in UNITS and not (config.families or config.split or config.episodes):
+    if kind not in (*UNITS, DAYS) and not (config.families or config.split or config.episodes):
         queries = {record.episode_id for record in base.records()}
     return plan_dataset(kind, config, queries).matching(base)
 

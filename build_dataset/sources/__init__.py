@@ -4,7 +4,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.constants import INFO_PATH
+from robomme_interference_data.constants import DEMONSTRATIONS, INFO_PATH
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError, nearest
 from robomme_interference_data.runtime.specs import (
     OWN,
@@ -14,6 +14,7 @@ from robomme_interference_data.runtime.specs import (
     import_factory,
     signature_of,
 )
+from robomme_interference_data.schema.days import DEFAULT_TASKS
 from robomme_interference_data.simulators.registry import SIMULATORS, simulator_class
 
 from .base import Frame, Recording, Robot, Source, SourceEpisode
@@ -48,6 +49,13 @@ SOURCES = Registry(
             name: SpecKind(name, f"{__name__}.simulator:SimulatorSource", arguments={"name": name})
             for name in SIMULATORS
         },
+        "tabletop-day": SpecKind(
+            "tabletop-day[:TASKS]",
+            f"{__name__}.day:DaySource",
+            "(?P<tasks>[0-9]{1,9})",
+            default=str(DEFAULT_TASKS),
+            arguments={"name": "tabletop-day"},
+        ),
         "sample": SpecKind(
             "sample[:FAMILY,…]", f"{__name__}.sample:SampleSource", "(?P<families>.*)"
         ),
@@ -56,12 +64,15 @@ SOURCES = Registry(
 )
 
 
-def open_source(specification: str, *, shifted: bool = False, **options: Any) -> Source:
+def open_source(
+    specification: str, *, kind: str = DEMONSTRATIONS, shifted: bool = False, **options: Any
+) -> Source:
     """Open a source.
 
     Args:
         specification: `KIND:LOCATION` or `KIND`; see `SOURCES`. Or `MODULE:NAME` of a simulator of
             the user, as in `make_simulator`.
+        kind: Name of the dataset that is built of it: a day is recorded, or asked about.
         shifted: Whether to open the first live observations under shifts instead of the episodes.
         **options: `columns`, `families_from` and `several_tasks` for `lerobot`, `every`,
             `simulator_python` and `simulator_options` for simulators; other kinds ignore them.
@@ -75,7 +86,8 @@ def open_source(specification: str, *, shifted: bool = False, **options: Any) ->
             f"Use {' or '.join(able)}, with demonstrations built from it.",
         )
     factory = SOURCES.factory(spec)
-    accepted, options = signature_of(factory).parameters, options | {"shifted": shifted}
+    accepted = signature_of(factory).parameters
+    options |= {"shifted": shifted, "kind": kind}
     known = {name: value for name, value in options.items() if name in accepted}
     source: Source = factory(**spec.arguments, **known)
     return source

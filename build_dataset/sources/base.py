@@ -1,7 +1,7 @@
 """The interface of a source of recorded episodes."""
 
 import re
-from collections.abc import Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import CAMERA_PREFIX, DIFFICULTIES
 from robomme_interference_data.errors import InterferenceError, SourceError, named, nearest
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema.records import MAX_GOAL, EvidenceSpan
+from robomme_interference_data.schema.records import MAX_GOAL, Day, EvidenceSpan
 from robomme_interference_data.storage.limits import MAX_NAME, MAX_RATE, MIN_RATE
 
 from ..alike import same_rate
@@ -62,6 +62,8 @@ class SourceEpisode:
             the file's time and size). Must be picklable.
         marked: False if the source knows that it cannot tell where the demonstration ends.
         further: Whether it is built only if its number is given.
+        number: Number that chooses it, if that is not its index: of a query of a day, the day's.
+        ability: What a query of a day needs of a memory; None for others.
         problem: Why it cannot be used, if the list already shows that; None if it can be read.
     """
 
@@ -69,6 +71,8 @@ class SourceEpisode:
     key: Any = field(default=None, compare=False)
     marked: bool = field(default=True, compare=False)
     further: bool = field(default=False, compare=False)
+    number: int | None = field(default=None, compare=False)
+    ability: str | None = field(default=None, compare=False)
     problem: InterferenceError | None = field(default=None, compare=False)
 
     def check(self) -> None:
@@ -150,6 +154,7 @@ class Recording:
         action_first: Whether the action of a frame was executed before its observation, instead of
             after it.
         scene: What the scene allows and hides, as in `Demonstration.scene`.
+        day: What a day holds, without digests; called when all frames are read. None for others.
     """
 
     goals: tuple[str, ...]
@@ -162,6 +167,7 @@ class Recording:
     robot: Robot = Robot()
     action_first: bool = False
     scene: str | None = None
+    day: Callable[[], Day] | None = None
 
     def __post_init__(self) -> None:
         if not self.goals or not all(goal.strip() for goal in self.goals):

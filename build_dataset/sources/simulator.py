@@ -98,7 +98,7 @@ class SimulatorSource(Source):
 
     @override
     def read(self, episode: SourceEpisode, cameras: tuple[str, ...] | None) -> Recording:
-        chosen = choose_cameras(cameras, self._class.cameras)
+        chosen = self._chosen(cameras)
         simulator = self._open(chosen)
         # Another object with these methods may know nothing of every n-th frame.
         every = self._every if isinstance(simulator, Simulator) else 1
@@ -119,6 +119,9 @@ class SimulatorSource(Source):
         if self._simulator is not None:
             self._simulator.close()
             self._simulator = None
+
+    def _chosen(self, cameras: tuple[str, ...] | None) -> tuple[str, ...]:
+        return choose_cameras(cameras, self._class.cameras)
 
     def _robot(self) -> Robot:
         names = {STATE: self._class.state_names, ACTION: self._class.action_names}

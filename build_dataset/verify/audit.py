@@ -9,6 +9,7 @@ from typing import Any
 from robomme_interference_data.constants import (
     CAMERA_PREFIX,
     CONTRADICTIONS,
+    DAYS,
     DEMONSTRATIONS,
     DISTRACTORS,
     MANIFEST_PATH,
@@ -111,6 +112,10 @@ def audit_buffer_set(buffer_set: BufferSet) -> Audit:
         kind = parse_condition(manifest.condition).kind
         for session in manifest.sessions:
             where = f"{manifest}: {session.source}"
+            if session.dataset == DAYS:  # tasks are no units: what a day holds is planned
+                if session.source.split not in ("train", manifest.episode_id.split):
+                    audit.leaks.append(Leak("of another split", where))
+                continue
             if session.source.split != "train" and not _is_query(session, manifest, kind):
                 audit.leaks.append(Leak("not a train episode", where))
             if session.role != "distractor":

@@ -16,6 +16,7 @@ from robomme_interference_data.build_dataset.dataset.identity import (
     report_of,
 )
 from robomme_interference_data.constants import (
+    DAYS,
     DISTRACTORS,
     EXECUTIONS,
     FETCH_RECORD,
@@ -40,7 +41,7 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.segment import typical_cosine
 from robomme_interference_data.schema.manifest import ManifestHeader
-from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.schema.records import Day, EpisodeRecord
 from robomme_interference_data.schema.shifts import SHIFTS
 from robomme_interference_data.storage.arrays import combine
 from robomme_interference_data.storage.files import all_files, is_hidden, sha256_file
@@ -192,13 +193,31 @@ def _record(where: str, name: str, record: EpisodeRecord, unit: Unit) -> Iterato
         expected = range(start + 1, start + 2)
     elif name == SHIFTED:
         expected = range(len(SHIFTS), len(SHIFTS) + 1)
-    elif name == EXECUTIONS:
+    elif name in (EXECUTIONS, DAYS):
         expected = range(1, record.length + 1)
     else:
         stored = unit.in_dataset(name)
         expected = range((unit.raw_frames - 1) // stored.stride + 1, stored.frames + 1)
     if record.length not in expected:
         yield Violation(where, f"holds {record.length} frames, not {expected[-1]}")
+    if (record.day is not None) != (name == DAYS):
+        yield Violation(where, "has no tasks" if record.day is None else "has tasks")
+    if record.day is not None:
+        yield from _day(where, record.day, record.length)
+
+
+def _day(where: str, day: Day, length: int) -> Iterator[Violation]:
+    """Check that the spans of a day are all its frames, and that its queries are asked in it."""
+    borders = [0, *(border for span in day.spans for border in (span.start, span.stop)), length]
+    if any(before != after for before, after in zip(borders[::2], borders[1::2], strict=True)):
+        yield Violation(where, f"its spans are not its {length} frames, one after the other")
+    for span in day.spans:
+        if not all(span.start <= shown.start < shown.stop <= span.stop for shown in span.evidence):
+            yield Violation(where, f"evidence of {span.source} is outside of its frames")
+    tasks = sum(span.part != "transition" for span in day.spans)
+    for query in day.queries:
+        if query.task not in range(tasks):
+            yield Violation(where, f"{query.episode} is asked after task {query.task} of {tasks}")
 
 
 def start_violations(
@@ -221,6 +240,7 @@ def start_violations(
 
 def _episode(where: str, dataset: Dataset, record: EpisodeRecord) -> Iterator[Violation]:
     recorded, spans = record.feature_sha256, record.spans
+    tasks = () if record.day is None else record.day.spans
     formats = _pixel_formats(dataset, record)
     exact = formats <= {codec.pix_fmt for codec in CODECS.values() if codec.exact}
     stated = CODECS.get(dataset.identity.codec)
@@ -228,11 +248,16 @@ def _episode(where: str, dataset: Dataset, record: EpisodeRecord) -> Iterator[Vi
         yield Violation(where, f"has videos in {', '.join(sorted(formats))}, not {stated.name}")
     if record.exact and not exact:
         yield Violation(where, "is exact, but its videos are lossy")
-    session, *parts = dataset.digests(record.episode_index, [record.session, *spans.values()])
+    held = [record.session, *spans.values(), *((span.start, span.stop) for span in tasks)]
+    session, *parts = dataset.digests(record.episode_index, held)
     for feature in sorted(session.keys() | recorded.keys()):
         if session.get(feature) != recorded.get(feature):
             yield Violation(where, f"{feature} does not have the recorded SHA-256")
-    for (name, (start, stop)), part in zip(spans.items(), parts, strict=True):
+    for span, part in zip(tasks, parts[len(spans) :], strict=True):
+        if combine(part) != span.sha256:
+            what = f"frames {span.start} to {span.stop - 1} do not have the recorded SHA-256"
+            yield Violation(where, what)
+    for (name, (start, stop)), part in zip(spans.items(), parts, strict=False):
         if combine(part) != getattr(record.span_sha256, name, None):
             what = f"frames {start} to {stop - 1} ({name}) do not have the recorded SHA-256"
             yield Violation(where, what)

@@ -44,7 +44,7 @@ from robomme_interference_data.errors import (
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Executor, Worker
 from robomme_interference_data.schema.codec import to_dict
-from robomme_interference_data.schema.records import EpisodeRecord, EvidenceSpan
+from robomme_interference_data.schema.records import Day, EpisodeRecord, EvidenceSpan
 from robomme_interference_data.simulators.registry import simulator_class
 from robomme_interference_data.storage.arrays import FeatureDigests, combine
 
@@ -177,6 +177,7 @@ def plan_replay(
         every = unit.in_dataset(name).stride if name in UNITS and unit.per_episode == 1 else 1
         source = open_source(
             simulator,
+            kind=name,
             shifted=name == SHIFTED,
             every=every,
             simulator_python=simulator_python,
@@ -248,9 +249,18 @@ def _differences(dataset: PlayedDataset, record: EpisodeRecord) -> Iterator[str]
             continue
         if played.get(feature) != record.feature_sha256.get(feature):
             yield f"{feature} is not what is seen when it is played again"
+    if recording.day is not None and recording.day() != _without_digests(record.day):
+        yield "its tasks, queries or evidence are others when it is played again"
     recorded = record.span_sha256
     if dataset.frames and recorded is not None and combine(query.current()) != recorded.query:
         yield "its first live observation is not what is seen when it is played again"
+
+
+def _without_digests(day: Day | None) -> Day | None:
+    """Return a day as its source describes it."""
+    if day is None:
+        return None
+    return replace(day, spans=tuple(replace(span, sha256="") for span in day.spans))
 
 
 def _of_metadata(name: str, recording: Recording, record: EpisodeRecord) -> Iterator[str]:

@@ -159,8 +159,8 @@ def _check_settings(config: AskConfig) -> None:
         check_unused(config, unused, config.model, "Leave it out, or ask a model.")
     elif ":" not in config.model:
         raise UnknownNameError(
-            f"there is no model {config.model!r}; expected recall, guess, openai:URL#MODEL, "
-            "transformers:ID or transformers:FOLDER",
+            f"there is no model {config.model!r}; expected recall, abstain, guess, "
+            "openai:URL#MODEL, transformers:ID or transformers:FOLDER",
             nearest(config.model, WITHOUT_MODEL, more=""),
         )
     else:
@@ -227,7 +227,9 @@ class AskFunction(RunFunction[AskConfig]):
             received = self.selector.select(buffer, query.frame(self.selector.camera)).tolist()
         memory = Memory.parse(config.memory)
         kept = memory.kept(received)
-        known = None if buffer.evidence is None else known_parts(buffer.evidence, kept)
+        known = None
+        if buffer.evidence is not None:
+            known = known_parts(buffer.evidence, kept, first_counts=query.first_counts)
         history = HistoryFrames(buffer, kept, self.history)  # decoded only for a model
         prompted = Prompted(question, query, config.model_seed, known, history)
         right = question.letters[question.right]
@@ -251,6 +253,7 @@ class AskFunction(RunFunction[AskConfig]):
             Status.SUCCESS if letter == right else Status.FAIL,
             seed=query.seed,
             difficulty=query.difficulty,
+            ability=query.record.ability,
             goal=query.goal,
             steps=0,  # nothing is executed
             **history_columns(buffer, received, memory, retrieved=self.selector is not None),

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from robomme_interference_data.data.query import Query
-from robomme_interference_data.data.questions import Question
-from robomme_interference_data.errors import FormatError
+from robomme_interference_data.data.questions import NOT_SHOWN, Question
+from robomme_interference_data.errors import FormatError, InvalidOptionError
 from robomme_interference_data.evaluate.run.config import AskConfig
 from robomme_interference_data.simulators.registry import recorded_scene
 from robomme_interference_data.storage.video.encode import decode_image
@@ -45,20 +45,36 @@ def guess(prompted: Prompted) -> str:
     return prompted.draw(prompted.question.letters)
 
 
+def abstain(prompted: Prompted) -> str:
+    """Choose the option that it was not shown."""
+    question = prompted.question
+    if NOT_SHOWN not in question.answers:
+        raise InvalidOptionError(
+            f"the question of {question.episode_id} has no option that it was not shown",
+            "Only questions of days have one: choose another model, such as guess.",
+            option="model",
+        )
+    return question.letters[question.answers.index(NOT_SHOWN)]
+
+
 def recall(prompted: Prompted) -> str:
-    """Draw one of the options that agree with what the kept frames show; of all if none does."""
+    """Draw one of the options that agree with what the kept frames show; of all if none does.
+
+    If they show nothing, and an option is that it was not shown, choose this one.
+    """
     question, scene = prompted.question, recorded_scene(prompted.query)
     if scene is None or max(question.answers) >= len(scene.answers):
         raise FormatError(
             f"the options of {question.episode_id} are not answers that its scene allows",
             "recall needs a simulator whose possible answers are known, such as tabletop.",
         )
+    if NOT_SHOWN in question.answers and not prompted.known:
+        return abstain(prompted)
     agreeing = {scene.choice(answer) for answer in scene.agreeing(prompted.known or {})}
-    choices = [scene.choice(scene.answers[number]) for number in question.answers]
     fits = [
         letter
-        for letter, choice in zip(question.letters, choices, strict=True)
-        if choice in agreeing
+        for letter, number in zip(question.letters, question.answers, strict=True)
+        if number != NOT_SHOWN and scene.choice(scene.answers[number]) in agreeing
     ]
     # Options are some of the scene's answers: what was seen may fit none of them.
     return prompted.draw("".join(fits) or question.letters)
@@ -81,9 +97,10 @@ class Responder:
 
 WITHOUT_MODEL = {
     "recall": Responder(answer=recall, reads_history=True, needs_scene=True),
+    "abstain": Responder(answer=abstain, reads_history=False, needs_scene=False),
     "guess": Responder(answer=guess, reads_history=False, needs_scene=False),
 }
-"""The responders without a model, by name: the ideal observer, and chance."""
+"""The responders without a model, by name: the ideal observer, one that never knows, chance."""
 
 
 class ModelResponder:

@@ -12,7 +12,12 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import MAX_ROW_BYTES
 from robomme_interference_data.data.buffer_set import BufferSet
-from robomme_interference_data.data.questions import Question, digest_questions, read_questions
+from robomme_interference_data.data.questions import (
+    NOT_SHOWN,
+    Question,
+    digest_questions,
+    read_questions,
+)
 from robomme_interference_data.errors import (
     FormatError,
     InvalidOptionError,
@@ -35,7 +40,7 @@ from .builtin import Noop, Privileged
 from .policy import RolloutInfo
 
 Answers = Mapping[WorkItem, int | None]
-"""Number of the chosen option's answer in `Scene.answers`; None where no option was chosen."""
+"""Number of the chosen option's answer in `Scene.answers`; None where nothing is to be done."""
 
 _ASK = "Give the folder of a run of questions (ask), or a CSV file of its rows."
 
@@ -43,7 +48,8 @@ _ASK = "Give the folder of a run of questions (ask), or a CSV file of its rows."
 class ActOutAnswers(Privileged):
     """`answers`: the simulator's script carries out what a run of questions answered.
 
-    Without a choice it holds the first pose, as `noop` does: that never succeeds.
+    Without a choice it holds the first pose, as `noop` does, and if the answer is that nothing was
+    shown, which succeeds where that is right.
 
     Args:
         path: Folder of a run of questions, or a CSV file of its rows. Workers do not read it.
@@ -129,7 +135,7 @@ def read_answers(
 
 
 def chosen_answer(row: Rollout, question: Question) -> int | None:
-    """Return the number of the answer that a row chose, or None if it chose no option.
+    """Return the number of the answer that a row chose, or None if it is to do nothing.
 
     Raises:
         FormatError: The row does not answer this question.
@@ -142,7 +148,8 @@ def chosen_answer(row: Rollout, question: Question) -> int | None:
             f"answer its question, whose options are {question.letters} and {right} is right",
             "Ask the questions of this buffer set again.",
         )
-    return None if letter is None else question.answers[question.letters.index(letter)]
+    answer = NOT_SHOWN if letter is None else question.answers[question.letters.index(letter)]
+    return None if answer == NOT_SHOWN else answer
 
 
 def _read_csv(path: Path) -> dict[WorkItem, Rollout]:

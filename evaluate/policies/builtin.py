@@ -203,8 +203,9 @@ class Recall(Privileged):
     """`recall`: the ideal observer, which uses marked evidence only, with some memory rule.
 
     It knows the parts of the hidden answer of whose evidence its memory keeps a frame; of two
-    lessons that show the same part, the newer one counts. It draws one of the answers that agree
-    from the episode's seed, and the simulator's script carries it out. It reads no images.
+    lessons that show the same part, the newer one counts, unless the goal says otherwise. It draws
+    one of the answers that agree from the episode's seed, and the simulator's script carries it
+    out. It reads no images.
 
     Args:
         memory: A rule, such as `full`, `framesamp:32` or `window:60@2`; see `Memory`.
@@ -223,7 +224,8 @@ class Recall(Privileged):
                 "recall needs to know which frames show the answer, which is unknown here",
                 "Build the buffer set from a source with evidence: see docs/reference/sources.md.",
             )
-        self._known = known_parts(info.evidence, self._memory.earlier(info.history_frames))
+        kept = self._memory.earlier(info.history_frames)
+        self._known = known_parts(info.evidence, kept, first_counts=info.first_counts)
 
     def act(self, observation: Observation, goal: str) -> NDArray[np.float32]:
         """Return the script's next action, `(1, 8) float32`; see `Privileged.act`."""

@@ -30,6 +30,8 @@ class RolloutInfo:
             None for all others.
         evidence: Which history frames show a part of the hidden answer, for privileged policies;
             None where that is unknown, and for all others.
+        first_counts: Whether the goal asks for the first of several lessons; otherwise the last
+            one counts.
         answer: For the policy `answers`: the number of the answer to carry out, in `Scene.answers`;
             None without a choice, and for all other policies.
     """
@@ -39,6 +41,7 @@ class RolloutInfo:
     seed: int
     simulator: Simulator | None = None
     evidence: tuple[Evidence, ...] | None = None
+    first_counts: bool = False
     answer: int | None = None
 
 

@@ -111,7 +111,13 @@ def run_rollout(
     rollout_info = RolloutInfo(info.goal, len(received), config.model_seed)
     if policy.privileged:
         evidence = buffer.evidence and evidence_among(buffer.evidence, received)
-        rollout_info = replace(rollout_info, simulator=simulator, evidence=evidence, answer=answer)
+        rollout_info = replace(
+            rollout_info,
+            simulator=simulator,
+            evidence=evidence,
+            first_counts=buffer.query.first_counts,
+            answer=answer,
+        )
     with (
         clock.part("history_s"),
         _decode(reader, buffer, received, policy, config) as chunks,
@@ -149,6 +155,7 @@ def run_rollout(
         status,
         seed=info.seed,
         difficulty=info.difficulty,
+        ability=buffer.query.record.ability,
         goal=info.goal,
         steps=live.steps,
         actions_sha256=live.sent.hexdigest(),

@@ -303,6 +303,7 @@ def _error_row(
         Status.ERROR,
         seed=query.seed,
         difficulty=query.difficulty,
+        ability=query.record.ability,
         goal=None,
         history_frames=0,
         lesson_frames=0,

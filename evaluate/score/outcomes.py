@@ -47,6 +47,7 @@ class Outcomes:
     evidence: NDArray[np.float64]  # share of the evidence kept, NaN if unknown, (S, C, E, M)
     action_l1: NDArray[np.float64]  # action error offline, NaN if not measured, (S, C, E, M)
     difficulty: NDArray[np.int64]  # index into DIFFICULTIES, −1 if unknown, (E,)
+    ability: NDArray[np.int64]  # index into ABILITIES, −1 if unknown or of no day, (E,)
     chance: NDArray[np.float64]  # success of guessing, NaN unless a question, (E,)
     expected: Flags  # the episodes of a complete cell, (E,)
     in_tables: Flags  # the cells that are expected or have rows, (S, C)

@@ -7,7 +7,7 @@ from operator import attrgetter
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import DIFFICULTIES, FAMILIES, RECORDINGS
+from robomme_interference_data.constants import ABILITIES, DIFFICULTIES, FAMILIES, RECORDINGS
 from robomme_interference_data.evaluate.systems import FACT_COLUMNS, SYSTEMS, SystemFacts
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, in_order
@@ -82,11 +82,14 @@ def _outcomes(
     status[at] = [STATUSES.index(row.status) for row in rows]
     evidence[at] = np.array([row.evidence_kept for row in rows], float)  # None becomes NaN
     action_l1[at] = np.array([row.action_l1 for row in rows], float)
-    difficulty, chance = np.full(len(episodes), -1), np.full(len(episodes), np.nan)
-    # Reading holds that the rows of an episode agree in both.
+    difficulty, ability = (np.full(len(episodes), -1) for _ in range(2))
+    chance = np.full(len(episodes), np.nan)
+    # Reading holds that the rows of an episode agree in all three.
     for row, episode in zip(rows, at[2].tolist(), strict=True):
         if row.difficulty is not None:
             difficulty[episode] = DIFFICULTIES.index(row.difficulty)
+        if row.ability is not None:
+            ability[episode] = ABILITIES.index(row.ability)
         if row.chance is not None:
             chance[episode] = row.chance
     facts = _facts_of(rows, systems)
@@ -101,6 +104,7 @@ def _outcomes(
         evidence,
         action_l1,
         difficulty,
+        ability,
         chance,
         expected=np.array([episode in expected for episode in episodes]),
         in_tables=applies | (status >= 0).any(axis=(2, 3)),

@@ -165,8 +165,7 @@ class Buffer:
         from robomme_interference_data.schema.evidence import map_evidence
 
         return map_evidence(
-            self.sessions,
-            lambda entry: self._datasets[entry.dataset].record(entry.episode_index).evidence,
+            self.sessions, lambda entry: self._datasets[entry.dataset].evidence(entry)
         )
 
     def fetch(self, cameras: Sequence[str] | None = None) -> None:

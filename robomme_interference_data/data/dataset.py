@@ -34,8 +34,8 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import from_dict, to_dict
-from robomme_interference_data.schema.manifest import SessionEntry
-from robomme_interference_data.schema.records import DatasetIdentity, EpisodeRecord
+from robomme_interference_data.schema.manifest import TEACHING, SessionEntry
+from robomme_interference_data.schema.records import DatasetIdentity, EpisodeRecord, EvidenceSpan
 from robomme_interference_data.storage.arrays import EMPTY_SHA256, combine, digest_spans
 from robomme_interference_data.storage.files import Files, read_sums, sha256_file
 from robomme_interference_data.storage.lerobot.dataset import LeRobotFiles
@@ -247,6 +247,19 @@ class Dataset:
         name, sha256 = record.episode_id, combine(record.feature_sha256)
         stored = self.kind, self.revision, record.episode_index
         return SessionEntry(role, name.family, name, *stored, *record.session, 1, sha256)
+
+    def evidence(self, entry: SessionEntry) -> Sequence[EvidenceSpan] | None:
+        """Return the evidence of the episode, or of the task of a day, that a session is of.
+
+        Tasks of a day that are no lesson of the query have none: they show other answers.
+        """
+        record = self.record(entry.episode_index)
+        if record.day is None:
+            return record.evidence
+        if entry.role not in TEACHING:
+            return ()
+        spans = (span for span in record.day.spans if span.start <= entry.start < span.stop)
+        return [shown for span in spans for shown in span.evidence]
 
     def index_of(self, episode: EpisodeId) -> int:
         """Return the number of an episode in the dataset, by its id.

@@ -55,6 +55,11 @@ class Query:
         return self.record.simulator
 
     @property
+    def first_counts(self) -> bool:
+        """Whether the first of several lessons counts, as its goal says, instead of the last."""
+        return self.record.ability == "order-first"
+
+    @property
     def lesson_frames(self) -> int:
         """Frames of its demonstration, without the first live observation."""
         start = self.record.exec_start_idx

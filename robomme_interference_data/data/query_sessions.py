@@ -10,16 +10,23 @@ from pathlib import Path
 
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
+    DAYS,
     DEMONSTRATIONS,
     DISTRACTORS,
     RAW_DISTRACTORS,
 )
-from robomme_interference_data.errors import BuildError, FormatError, HashMismatchError, SourceError
+from robomme_interference_data.errors import (
+    BuildError,
+    FormatError,
+    HashMismatchError,
+    SourceError,
+    named,
+)
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import Condition, parse_condition
-from robomme_interference_data.schema.draw import UnitPool, check_units
+from robomme_interference_data.schema.draw import UnitPool, check_units, no_lesson
 from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry, layout_sessions
-from robomme_interference_data.schema.records import EpisodeRecord
+from robomme_interference_data.schema.records import Day, DayQuery, DaySpan, EpisodeRecord
 from robomme_interference_data.schema.sampling import lesson_frames, lesson_share
 from robomme_interference_data.storage.files import LocalFiles
 
@@ -105,6 +112,28 @@ class SessionSource:
         ]
         return max(sessions, key=lambda session: session.num_frames)
 
+    def day_of(self, episode: EpisodeId) -> tuple[EpisodeRecord, Day, DayQuery]:
+        """Return the day that holds a query episode, and where in it."""
+        if episode not in self._days:
+            raise SourceError(
+                f"{episode} is a query of none of the days in "
+                f"{self.datasets[DAYS].files.describe()}",
+                "Build the days and the demonstrations of the same numbers.",
+                f"build BUFFER_SET --only {DAYS} --source KIND",
+            )
+        return self._days[episode]
+
+    @cached_property
+    def _days(self) -> dict[EpisodeId, tuple[EpisodeRecord, Day, DayQuery]]:
+        found = {}
+        for record in self.datasets[DAYS].records():
+            if record.day is None:
+                where = self.datasets[DAYS].files.describe()
+                raise FormatError.damaged(where, f"{record.episode_id}: no tasks")
+            for query in record.day.queries:
+                found[query.episode] = record, record.day, query
+        return found
+
     @cached_property
     def _queries(self) -> "dict[EpisodeId, QuerySessions]":
         return {}
@@ -135,6 +164,8 @@ class QuerySessions:
     def lesson(self, part: str = "lesson") -> SessionEntry:
         """Return the lesson, or a part of it."""
         record = self._record
+        if record.ability == "absent":
+            raise no_lesson(record.episode_id)
         whole = self._source.session(DEMONSTRATIONS, record.episode_id)
         if part == "lesson":
             return whole
@@ -162,11 +193,57 @@ class QuerySessions:
         """Return the lesson in the query's scene with another answer."""
         return self._source.session(CONTRADICTIONS, self._record.episode_id)
 
+    def day(self, k: int) -> Sequence[SessionEntry]:
+        """Return the sessions of the query's day up to `k` tasks after its last lesson.
+
+        Raises:
+            BuildError: So many tasks do not follow.
+        """
+        query = self._record.episode_id
+        record, day, asked = self._source.day_of(query)
+        tasks = [span for span in day.spans if span.part != "transition"]
+        further = len(tasks) - 1 - asked.task
+        if k > further:
+            raise BuildError(
+                f"{query} is shown {further} tasks before the end of {record.episode_id}; a "
+                f"condition needs {k} further tasks",
+                f"Choose {named('conditions')} with fewer, or build longer days.",
+            )
+        stop = tasks[asked.task + k].stop
+        dataset = self._source.datasets[DAYS]
+        return [
+            SessionEntry(
+                _role_in_day(span, query),
+                span.source.family,
+                span.source,
+                dataset.kind,
+                dataset.revision,
+                record.episode_index,
+                span.start,
+                span.stop,
+                1,
+                span.sha256,
+            )
+            for span in day.spans
+            if span.stop <= stop
+        ]
+
     def _draw(self, k: int, *, same_family: bool) -> Sequence[EpisodeId]:
         if k > len(self._drawn[same_family]):  # a shorter draw is the beginning of a longer one
             draw = self._source.pool.draw_own if same_family else self._source.pool.draw
             self._drawn[same_family] = draw(self._record.episode_id, k)
         return self._drawn[same_family][:k]
+
+
+def _role_in_day(span: DaySpan, query: EpisodeId) -> str:
+    """Return the role that a span of a day has for one of its queries; one of `ROLES`."""
+    if span.part == "transition":
+        return "transition"
+    if span.part == "idle":
+        return "filler"
+    if span.source == query:
+        return "lesson"
+    return "contradiction" if span.source.scene == query else "distractor"
 
 
 def buffer_manifest(

@@ -22,6 +22,9 @@ from .buffer_set import BufferSet
 LETTERS = string.ascii_uppercase[:8]
 """Letters of options, in order."""
 
+NOT_SHOWN = -1
+"""Number in `Question.answers` of the option that it was not shown; only days have it."""
+
 
 # Five digits: no image that can be read has as many pixels on a side.
 _POINTS = re.compile(r"(?:-?\d{1,5},-?\d{1,5}(?: -?\d{1,5},-?\d{1,5})*)?")
@@ -39,7 +42,9 @@ class Question:
         "The options in words, in the order of `LETTERS`; empty where only the picture shows one.",
     ]
     answers: Annotated[
-        tuple[int, ...], "Number of each option's answer among the scene's possible answers."
+        tuple[int, ...],
+        "Number of each option's answer among the scene's possible answers; -1 if the option is "
+        "that it was not shown, the last one in days.",
     ]
     right: Annotated[int, "Index of the right option, from 0."]
     points: Annotated[
@@ -55,7 +60,7 @@ class Question:
         count = len(self.options)
         if not 2 <= count <= len(LETTERS) or len(set(self.answers)) != count:
             raise FormatError(f"{count} options with {len(set(self.answers))} different answers")
-        if not 0 <= self.right < count or min(self.answers) < 0:
+        if not 0 <= self.right < count or min(self.answers) < NOT_SHOWN:
             raise FormatError(f"right option {self.right} of {count}, answers {self.answers}")
         if len(self.points) != count or not all(map(_POINTS.fullmatch, self.points)):
             raise FormatError(f"{count} options with the points {self.points}")

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from robomme_interference_data.constants import (
     CONTRADICTIONS,
     DATASETS,
+    DAYS,
     DEMONSTRATIONS,
     DISTRACTORS,
     MAX_K,
@@ -53,6 +54,10 @@ class SessionProvider(Protocol):
 
     def contradiction(self) -> "SessionEntry":
         """Return a demonstration in the query's scene with another answer."""
+        ...
+
+    def day(self, k: int) -> "Sequence[SessionEntry]":
+        """Return the query's day up to `k` tasks after its last lesson; nested in `k`."""
         ...
 
 
@@ -163,13 +168,35 @@ _KINDS = (
         "how far a memory is believed",
         (CONTRADICTIONS,),
     ),
+    ConditionKind(
+        "day",
+        lambda p, k: tuple(p.day(k)),
+        "the query's day until n tasks after its last lesson, without a cut",
+        "one stream without borders",
+        (DAYS,),
+    ),
+    ConditionKind(
+        "day-cut",
+        lambda p, k: tuple(s for s in p.day(k) if s.role != "transition"),
+        "the same without the transitions between tasks",
+        "borders",
+        (DAYS,),
+    ),
+    ConditionKind(
+        "day-alone",
+        lambda p, k: tuple(s for s in p.day(0) if s.role in ("lesson", "contradiction")),
+        "the query's lessons of that day alone",
+        "the same lessons without anything else",
+        (DAYS,),
+        counted=False,
+    ),
 )
 
 KINDS: dict[str, ConditionKind] = {kind.name: kind for kind in _KINDS}
 """All kinds by name, in the order of tables."""
 
 # No leading zeros: a condition has one spelling.
-_COUNTED = re.compile(r"(?:(?P<kind>[a-z]+)-)?k(?P<k>0|[1-9][0-9]?)")
+_COUNTED = re.compile(r"(?:(?P<kind>[a-z]+(?:-[a-z]+)*)-)?k(?P<k>0|[1-9][0-9]?)")
 
 
 @dataclass(frozen=True)
@@ -213,7 +240,7 @@ def parse_condition(text: str | Condition) -> Condition:
             return Condition(text, KINDS[text], 0)
         match = _COUNTED.fullmatch(text)
         kind = KINDS.get(match["kind"] or "k") if match and match["kind"] != "k" else None
-        if match and kind is not None and int(match["k"]) <= MAX_K:
+        if match and kind is not None and kind.counted and int(match["k"]) <= MAX_K:
             return Condition(text, kind, int(match["k"]))
     raise InvalidIdError(
         f"{text!r} is not a condition",

@@ -24,7 +24,7 @@ Rule version 1, for a query of family F and index i:
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import islice
@@ -134,17 +134,37 @@ class UnitPool:
 
 
 def check_units(
-    pool: UnitPool, queries: Iterable[EpisodeId], conditions: Iterable[Condition]
+    pool: UnitPool,
+    queries: Iterable[EpisodeId],
+    conditions: Iterable[Condition],
+    absent: Collection[EpisodeId] = (),
 ) -> None:
-    """Check that a pool has the units of all buffers.
+    """Check that a pool has the units of all buffers, and that every query has what it needs.
+
+    Args:
+        pool: The units.
+        queries: The query episodes.
+        conditions: The conditions.
+        absent: Those of them that no lesson is shown for.
 
     Raises:
-        BuildError: It has too few; the message says how many.
+        BuildError: The pool has too few units; the message says how many. Or a condition needs the
+            lesson of one of `absent`.
     """
     chosen = list(conditions)
-    for query in {episode.family: episode for episode in sorted(queries)}.values():
+    # Queries of a family draw alike.
+    checked = {episode.family: episode for episode in sorted(queries)}
+    for query in [*checked.values(), *sorted(absent)]:
         for condition in chosen:
-            condition.sessions(_UnreadSessions(query, pool))
+            condition.sessions(_UnreadSessions(query, pool, query in absent))
+
+
+def no_lesson(query: EpisodeId) -> BuildError:
+    """Return the error about a condition that needs the lesson of a query without one."""
+    return BuildError(
+        f"{query} has no lesson: its day never shows it, to ask whether a memory knows that",
+        f"Choose {named('conditions')} of days alone: no-history,day-alone,day-k0,day-k3",
+    )
 
 
 @dataclass(frozen=True)
@@ -153,8 +173,11 @@ class _UnreadSessions:
 
     query: EpisodeId
     pool: UnitPool
+    absent: bool
 
     def lesson(self, part: str = "lesson") -> Any:
+        if self.absent:
+            raise no_lesson(self.query)
         return self.query
 
     def contradiction(self) -> Any:
@@ -165,6 +188,9 @@ class _UnreadSessions:
 
     def own_units(self, k: int) -> Sequence[Any]:
         return self.pool.draw_own(self.query, k)
+
+    def day(self, k: int) -> Sequence[Any]:
+        return ()  # how many tasks follow is checked when the buffers are planned
 
 
 def _hash(seed: int, *parts: str) -> bytes:

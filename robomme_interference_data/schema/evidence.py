@@ -10,11 +10,8 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any
 
-from .manifest import Session, SessionEntry
+from .manifest import TEACHING, Session, SessionEntry
 from .records import EvidenceSpan
-
-_TEACHING = ("lesson", "contradiction")
-"""Roles of sessions whose evidence must be known."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +78,7 @@ def map_evidence(
     for session in sessions:
         entry, spans = session.entry, recorded(session.entry)
         # A unit's frames show nothing of the answer, whether its source labels frames or not.
-        if spans is None and session.role in _TEACHING:
+        if spans is None and session.role in TEACHING:
             return None
         for span in spans or ():
             start, stop = max(span.start, entry.start), min(span.stop, entry.stop)
@@ -106,12 +103,17 @@ def evidence_among(evidence: Iterable[Evidence], frames: Sequence[int]) -> tuple
 
 
 def known_parts(
-    evidence: Sequence[Evidence], kept: Collection[int], frames: int = 1
+    evidence: Sequence[Evidence],
+    kept: Collection[int],
+    frames: int = 1,
+    *,
+    first_counts: bool = False,
 ) -> dict[int, str]:
     """Return the texts of the parts of the answer that frames of the buffer show, newest first.
 
-    If two sessions show the same part, the later one counts, regardless of its role. A part is
-    known if at least `frames` of the kept frames show it.
+    If two sessions show the same part, the later one counts, regardless of its role; the earlier
+    one if `first_counts`, because the goal says so. A part is known if at least `frames` of the
+    kept frames show it.
     """
     counts = Counter[tuple[int, str]]()
     for entry in evidence:
@@ -119,8 +121,8 @@ def known_parts(
             entry.start <= frame < entry.stop for frame in kept
         )
     texts: dict[int, str] = {}
-    # The last one that shows a part is the first to be set, and stays.
-    for entry in reversed(evidence):
+    # What shows a part and is set first stays.
+    for entry in evidence if first_counts else reversed(evidence):
         if counts[entry.span.part, entry.span.text] >= frames and entry.seen(kept):
             texts.setdefault(entry.span.part, entry.span.text)
     return texts

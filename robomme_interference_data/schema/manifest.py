@@ -12,9 +12,13 @@ from typing import Annotated
 from robomme_interference_data.errors import FormatError
 from robomme_interference_data.ids import EpisodeId
 
-ROLES = ("lesson", "distractor", "filler", "contradiction")
-"""Roles of a session: the query's demonstration or a part of it, a distractor unit, frames without
-content, or a lesson with another answer. The paper's conditions use the first two."""
+ROLES = ("lesson", "distractor", "filler", "contradiction", "transition")
+"""Roles of a session: the query's demonstration or a part of it; a distractor unit, or another task
+of a day; frames without content; a lesson with another answer; the time between two tasks of a day.
+The paper's conditions use the first two."""
+
+TEACHING = ("lesson", "contradiction")
+"""Roles of sessions whose evidence must be known."""
 
 _MAX_HISTORY = 1 << 18  # frames of a buffer: seven hours; the paper's longest have some thousand
 _MAX_SESSIONS = 1 << 12  # of a buffer
@@ -24,7 +28,7 @@ _MAX_SESSIONS = 1 << 12  # of a buffer
 class SessionEntry:
     """One session of a history buffer: where its frames are stored, and their digest."""
 
-    role: Annotated[str, "One of `lesson`, `distractor`, `filler`, `contradiction`."]
+    role: Annotated[str, "One of `lesson`, `distractor`, `filler`, `contradiction`, `transition`."]
     family: Annotated[str, "Family of the recorded episode."]
     source: Annotated[EpisodeId, "Id of the recorded episode."]
     dataset: Annotated[str, "Name of the dataset in the buffer set, such as `demonstrations`."]
@@ -108,7 +112,7 @@ class BufferManifest:
 
     episode_id: Annotated[EpisodeId, "The query episode."]
     condition: Annotated[str, "Name of the condition; with `episode_id`, the buffer's key."]
-    k: Annotated[int, "Number of sessions that the condition adds."]
+    k: Annotated[int, "Number of sessions, of a day tasks, that the condition adds."]
     goals: Annotated[tuple[str, ...], "Wordings of the query's goal; at least one."]
     seed: Annotated[int | None, "Seed of the query episode in its simulator, or None."]
     difficulty: Annotated[str | None, "`easy`, `medium`, `hard`, or None."]

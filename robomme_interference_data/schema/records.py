@@ -53,6 +53,37 @@ class EvidenceSpan:
 
 
 @dataclass(frozen=True)
+class DaySpan:
+    """Stored frames of a day: a task, a piece of one, or a transition between tasks."""
+
+    source: Annotated[EpisodeId, "The episode that is played; otherwise the day."]
+    part: Annotated[str, "One of `lesson`, `first`, `second`, `idle`, `transition`."]
+    shift: Annotated[str, "How the table looks: `none`, or a shift such as `light:2`."]
+    start: Annotated[int, "First frame."]
+    stop: Annotated[int, "Frame after the last one."]
+    sha256: Annotated[str, "Digest over the span."]
+    evidence: Annotated[
+        tuple[EvidenceSpan, ...], "Frames of the day that show parts of the episode's answer."
+    ]
+
+
+@dataclass(frozen=True)
+class DayQuery:
+    """A query of a day, and when it can be asked first."""
+
+    episode: Annotated[EpisodeId, "The query episode."]
+    task: Annotated[int, "Number of the task, from 0, after which it can be asked."]
+
+
+@dataclass(frozen=True)
+class Day:
+    """What a recorded day holds: all its frames in spans, and its queries."""
+
+    spans: Annotated[tuple[DaySpan, ...], "The spans, one after the other."]
+    queries: Annotated[tuple[DayQuery, ...], "The queries, in canonical order."]
+
+
+@dataclass(frozen=True)
 class EpisodeRecord:
     """An episode of a dataset, with the metadata of its source."""
 
@@ -90,6 +121,11 @@ class EpisodeRecord:
         "What the scene allows and hides, as JSON of the simulator; None if it follows from the "
         "seed, or is unknown.",
     ] = None
+    ability: Annotated[
+        str | None,
+        "What a query of a day needs of a memory: one of `days.ABILITIES`; None for others.",
+    ] = None
+    day: Annotated[Day | None, "The tasks and queries of a day; None for other episodes."] = None
 
     def __post_init__(self) -> None:
         name, start, spans = self.episode_id, self.exec_start_idx, self.evidence or ()

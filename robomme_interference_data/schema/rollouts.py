@@ -79,6 +79,10 @@ class OutcomeColumns:
     seed: Annotated[int | None, "Seed of the scene, or None."]
     difficulty: Annotated[str | None, "`easy`, `medium`, `hard`, or None."]
     goal: Annotated[str | None, "The goal that the policy received."]
+    ability: Annotated[
+        str | None,
+        "What a query of a day needs of a memory, such as `update`; None for other queries.",
+    ] = None
     status: Annotated[
         str, "`success`, `fail`, `timeout` (after 1300 steps), `error`, or offline `measured`."
     ]

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 SIMULATORS: dict[str, str | Callable[..., Simulator]] = {
     "tabletop": f"{__package__}.tabletop.simulator:TabletopSimulator",
+    "tabletop-day": f"{__package__}.tabletop.day_simulator:TabletopDaySimulator",
     "robomme": f"{__package__}.robomme.simulator:RoboMMESimulator",
 }
 """Name to a factory, or to its location `module:name`; add your own simulators here."""
@@ -36,7 +37,8 @@ def make_simulator(name: str, **options: Any) -> Simulator:
     """Make a simulator in this process; make only one per process.
 
     Args:
-        name: `tabletop`, `robomme`, or `module:name` of a class or function of your own.
+        name: `tabletop`, `tabletop-day`, `robomme`, or `module:name` of a class or function of your
+            own.
         **options: Passed to the simulator; see `TabletopSimulator` and `RoboMMESimulator`.
 
     Raises:

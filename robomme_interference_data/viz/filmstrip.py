@@ -23,6 +23,9 @@ LESSON_COLOR = Hue.VERMILION
 COLORS = (Hue.SKY, Hue.ORANGE, Hue.GREEN, Hue.PINK, Hue.BLUE, Hue.YELLOW, "#999999", "#000000")
 """Of the other sessions."""
 
+_NO_FAMILY = {"lesson": LESSON_COLOR, "transition": "#dddddd"}
+"""Colors by role of sessions that have none of their family."""
+
 # Inches.
 _WIDTH = 7.2  # text width of a two-column page
 _MARGIN = 0.1
@@ -37,6 +40,8 @@ _BAR = 0.28  # timeline
 _MARK = 0.045  # dark line below evidence
 
 _GRAY = "#555555"
+_MANY = 12
+"""Sessions on a page from which each gets less room."""
 _COLUMNS = 12
 """Frames in a row of the page."""
 
@@ -60,7 +65,7 @@ def arrange(frames: Sequence[int]) -> tuple[int, list[Block]]:
     A unit takes one slot, a longer session as many as its frames fill, up to a row.
     """
     # More sessions on a page, each with fewer frames.
-    slots = 4 if len(frames) <= 12 else 6
+    slots = 4 if len(frames) <= _MANY else 6
     blocks, row, slot = [], 0, 0
     for count in frames:
         width = slots if len(frames) == 1 else min(slots, max(1, count // UNIT_FRAMES))
@@ -74,11 +79,12 @@ def arrange(frames: Sequence[int]) -> tuple[int, list[Block]]:
 def session_colors(sessions: Sequence[Session]) -> list[str]:
     """Return a color for each session: one for the lesson, and one for each other family.
 
-    Families get colors in order of appearance, so they keep them when k grows.
+    Families get colors in order of appearance, so they keep them when k grows. The transitions of a
+    day are pale, so that its tasks stand out.
     """
-    families = dict.fromkeys(s.family for s in sessions if s.role != "lesson")
+    families = dict.fromkeys(s.family for s in sessions if s.role not in _NO_FAMILY)
     by_family = {family: COLORS[n % len(COLORS)] for n, family in enumerate(families)}
-    return [LESSON_COLOR if s.role == "lesson" else by_family[s.family] for s in sessions]
+    return [_NO_FAMILY.get(s.role) or by_family[s.family] for s in sessions]
 
 
 def round_step(frames: int, most: int) -> int:
@@ -159,12 +165,13 @@ def _draw_head(page: Page, buffer: "Buffer", camera: str) -> float:
 
 def _draw_sessions(page: Page, buffer: "Buffer", camera: str, top: float) -> float:
     """Draw all sessions and return the y below them."""
-    slots, blocks = arrange([len(s) for s in buffer.sessions])
     colors = session_colors(buffer.sessions)
+    drawn = [(n, s) for n, s in enumerate(buffer.sessions) if s.role != "transition"]
+    slots, blocks = arrange([_drawn_frames(s, among=len(drawn)) for _, s in drawn])
     per_slot = _COLUMNS // slots
     pitch = (_INNER + _GAP) / slots
     size = (pitch - _GAP - (per_slot - 1) * _FRAME_GAP) / per_slot
-    for number, (session, block) in enumerate(zip(buffer.sessions, blocks, strict=True)):
+    for (number, session), block in zip(drawn, blocks, strict=True):
         width = block.slots * pitch - _GAP
         # A session of several slots spreads its frames over the gaps between the slots.
         step = (width - size) / (block.slots * per_slot - 1)
@@ -182,6 +189,13 @@ def _draw_sessions(page: Page, buffer: "Buffer", camera: str, top: float) -> flo
             page.text(x + size / 2, y + _BAND + tall + 0.015, str(index), _NUMBER, color=_GRAY)
             x += step
     return y + height + _GAP if blocks else top
+
+
+def _drawn_frames(session: Session, among: int) -> int:
+    """Return the frames for which a session gets room: among many only the lesson's all count."""
+    if session.role == "lesson" or among <= _MANY:
+        return len(session)
+    return min(len(session), 2 * UNIT_FRAMES)
 
 
 def _draw_card(

@@ -20,7 +20,12 @@ from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.question_pictures import picture
 from robomme_interference_data.build_dataset.questions import make_questions, planned_questions
 from robomme_interference_data.constants import DEMONSTRATIONS, FAMILIES, QUESTIONS_PATH
-from robomme_interference_data.data.questions import Question, digest_questions, read_questions
+from robomme_interference_data.data.questions import (
+    NOT_SHOWN,
+    Question,
+    digest_questions,
+    read_questions,
+)
 from robomme_interference_data.errors import BuildError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.simulators.tabletop.camera import SIZE
@@ -39,13 +44,15 @@ MANY = ("InsertPeg", "PatternLock", "RouteStick")
 """Families of whose possible answers some are options; of the others all are."""
 
 
-def buffer_set_of(*episodes: EpisodeId, view: Any = GRAY, **changes: Any) -> Any:
+def buffer_set_of(
+    *episodes: EpisodeId, view: Any = GRAY, ability: str | None = None, **changes: Any
+) -> Any:
     """A stand-in for a buffer set, with episodes of the suite that were not recorded."""
 
     def query(episode: EpisodeId) -> Any:
         seed = seed_of(episode)
         known = {"simulator": "tabletop", "seed": seed, "difficulty": difficulty_of(seed)}
-        record = SimpleNamespace(scene=None)
+        record = SimpleNamespace(scene=None, ability=ability)
         values = known | {"episode_id": episode, "frame": lambda: view, "record": record} | changes
         return SimpleNamespace(**values)
 
@@ -98,6 +105,25 @@ def test_the_right_option_is_the_scenes_answer_and_there_once(
         assert len(choices) == (len(possible) if len(possible) <= 5 else 4)
         assert question.chance == 1 / len(choices)
         assert question.letters == "ABCDE"[: len(choices)]
+
+
+@pytest.mark.parametrize("family", ["MoveCube", "PatternLock", "VideoUnmask"])
+def test_questions_of_days_have_the_option_that_it_was_not_shown(family: str) -> None:
+    episode = EpisodeId(family, "test", 3)
+    [plain] = make(episode)
+
+    def of_day(ability: str) -> Made:
+        [(question, marks)] = planned_questions(buffer_set_of(episode, ability=ability))
+        return Made(question, tuple(marks))
+
+    shown, absent = of_day("update"), of_day("absent")
+    for one in (shown, absent):
+        assert one.question.options == (*plain.question.options, "it was not shown")
+        assert one.question.answers == (*plain.question.answers, NOT_SHOWN)
+        assert one.question.points == (*plain.question.points, "")
+        assert one.marks == plain.marks  # nothing new in the picture
+    assert shown.question.right == plain.question.right
+    assert absent.question.right == len(plain.question.options)
 
 
 @pytest.mark.slow

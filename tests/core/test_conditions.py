@@ -46,6 +46,13 @@ class Material:
     def contradiction(self) -> SessionEntry:
         return entry("contradiction", 98)
 
+    def day(self, k: int) -> Sequence[SessionEntry]:
+        """Another task, two lessons, and k further tasks, each after a transition."""
+        roles = ("distractor", "contradiction", "lesson", *["distractor"] * k)
+        tasks = [entry(role, 300 + number) for number, role in enumerate(roles)]
+        moved = [entry("transition", 400 + number) for number in range(len(tasks))]
+        return [session for pair in zip(moved, tasks, strict=True) for session in pair]
+
 
 def numbers(name: str) -> list[int]:
     return [one.source.index for one in parse_condition(name).sessions(Material())]
@@ -63,7 +70,8 @@ def test_the_papers_conditions() -> None:
 
 
 def test_those_beyond_the_paper() -> None:
-    assert {kind.name: numbers(f"{kind.name}-k3") for kind in list(KINDS.values())[2:]} == {
+    counted = [kind.name for kind in KINDS.values() if kind.counted and kind.name != "k"]
+    assert {name: numbers(f"{name}-k3") for name in counted} == {
         "before": [0, 1, 2, 99],
         "middle": [0, 1, 99, 2],
         "held": [99, 90, 90, 90],
@@ -73,25 +81,32 @@ def test_those_beyond_the_paper() -> None:
         "absent": [0, 1, 2],
         "stale": [98, 99, 0, 1, 2],
         "misled": [98, 0, 1, 2],
+        "day": [400, 300, 401, 301, 402, 302, 403, 303, 404, 304, 405, 305],
+        "day-cut": [300, 301, 302, 303, 304, 305],
     }
+    assert numbers("day-alone") == [301, 302]
     assert numbers("middle-k1") == [0, 99]
     assert numbers("misled-k0") == [98]
 
 
-@given(st.sampled_from([kind for kind in KINDS if kind != "no-history"]), st.integers(0, 63))
+COUNTED = [name for name, kind in KINDS.items() if kind.counted]
+
+
+@given(st.sampled_from(COUNTED), st.integers(0, 63))
 def test_more_sessions_are_only_added(kind: str, k: int) -> None:
     """Whatever comes more, the lesson stays as it is: conditions of a kind differ by units."""
     name = "k" if kind == "k" else f"{kind}-k"
     fewer, more = (Counter(numbers(f"{name}{count}")) for count in (k, min(k + 1, 63)))
     assert fewer <= more
-    assert (more - fewer).total() == (k < 63)
+    sessions = 2 if kind == "day" else 1  # a task, and the transition before it
+    assert (more - fewer).total() == (k < 63) * sessions
 
 
 @given(st.sampled_from(list(KINDS)), st.integers(0, 63))
 def test_names(kind: str, k: int) -> None:
-    name = {"no-history": kind, "k": f"k{k}"}.get(kind, f"{kind}-k{k}")
+    name = {"k": f"k{k}"}.get(kind, f"{kind}-k{k}" if kind in COUNTED else kind)
     condition = parse_condition(name)
-    counted = 0 if kind == "no-history" else k
+    counted = k if kind in COUNTED else 0
     assert (condition.name, condition.k, str(condition)) == (name, counted, name)
     assert condition.kind is KINDS[kind]
     assert parse_condition(condition) is condition
@@ -101,7 +116,7 @@ def test_names(kind: str, k: int) -> None:
 @pytest.mark.parametrize(
     "given",
     [
-        *("", "k", "k64", "k-1", "k03", "K3", "no-history-k0", "x-k3", " k3"),
+        *("", "k", "k64", "k-1", "k03", "K3", "no-history-k0", "day-alone-k3", "x-k3", " k3"),
         *("before", "before-k64", "before-3", 3),
     ],
 )
@@ -126,7 +141,8 @@ def test_what_a_buffer_set_must_hold() -> None:
     assert needed("no-history", "before-k3") == ("demonstrations", "distractors")
     every = "demonstrations", "distractors", "distractors-raw", "contradictions"
     assert needed("misled-k0", "k0", "raw-k1") == every
-    assert (*every, "shifted", "executions") == DATASETS  # no condition needs the last two
+    assert needed("day-k3", "day-alone") == ("demonstrations", "distractors", "days")
+    assert (*every, "shifted", "executions", "days") == DATASETS  # none needs the two before
 
     assert all(kind.name == name and kind.holds and kind.asks for name, kind in KINDS.items())
 

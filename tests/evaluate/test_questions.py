@@ -17,9 +17,9 @@ from support.tabletop import LESSON, QUERIES, TABLETOP, copy_tabletop, scene_of,
 from robomme_interference_data import load_buffer_set
 from robomme_interference_data.build_dataset.questions import write_questions
 from robomme_interference_data.constants import DEMONSTRATIONS, FAMILIES
-from robomme_interference_data.data.questions import Question
+from robomme_interference_data.data.questions import NOT_SHOWN, Question
 from robomme_interference_data.errors import InterferenceError, InvalidOptionError
-from robomme_interference_data.evaluate.language.questions import Prompted, guess
+from robomme_interference_data.evaluate.language.questions import Prompted, abstain, guess, recall
 from robomme_interference_data.evaluate.run import evaluation
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.storage.video.encode import decode_image
@@ -93,6 +93,25 @@ def test_guesses_are_right_by_chance() -> None:
             expected += question.chance
             variance += question.chance * (1 - question.chance)
     assert abs(hits - expected) < 3.5 * variance**0.5
+
+
+def test_an_observer_of_a_day_that_saw_nothing_says_so() -> None:
+    buffer_set = load_buffer_set(TABLETOP)
+    for episode, plain in questions().items():
+        question = dataclasses.replace(
+            plain,
+            options=(*plain.options, "it was not shown"),
+            answers=(*plain.answers, NOT_SHOWN),
+            points=(*plain.points, ""),
+        )
+        query = buffer_set.query(episode)
+        everything = {span.part: span.text for span in query.record.evidence or ()}
+        last = question.letters[-1]
+        for known, right in (({}, last), (everything, question.letters[question.right])):
+            assert recall(Prompted(question, query, 0, known, NO_HISTORY)) == right
+        assert abstain(Prompted(question, query, 0, everything, NO_HISTORY)) == last
+        with pytest.raises(InvalidOptionError):
+            abstain(Prompted(plain, query, 0, {}, NO_HISTORY))
 
 
 # --- which frames a model gets -----------------------------------------------------------------
@@ -232,7 +251,7 @@ def test_a_damaged_picture_breaks_only_its_question(tmp_path: Path) -> None:
         ({"control": "blnk"}, "control 'blnk' is none of none, blank, text"),
         ({"control": "blank"}, "`control` has no effect on recall"),
         ({"model": "guess", "memory": "window"}, "`memory` has no effect on guess"),
-        ({"model": "recal"}, "there is no model 'recal'; expected recall, guess, openai:URL"),
+        ({"model": "recal"}, "there is no model 'recal'; expected recall, abstain, guess"),
         ({"model": "openai:http://h/v1#m", "system": "m", "prompt": "x"}, "no prompt or file 'x'"),
         ({"retrieval": "thumbnail", "conditions": ("no-history",)}, "nothing to retrieve from"),
     ],

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from robomme_interference_data.constants import DIFFICULTIES, RECORDINGS
+from robomme_interference_data.constants import ABILITIES, DIFFICULTIES, RECORDINGS
 from robomme_interference_data.evaluate.score.scoring import Score
 from robomme_interference_data.evaluate.systems import published_base
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, parse_condition
@@ -113,6 +113,11 @@ def _difficulty(figure: Any, data: Data) -> bool:
     return _panels(figure, data, panels, data.systems)
 
 
+def _ability(figure: Any, data: Data) -> bool:
+    panels = {part: (data, part) for part in data.parts(ABILITIES)}
+    return _panels(figure, data, panels, data.systems)
+
+
 def _retrieval(figure: Any, data: Data) -> bool:
     systems = []
     for system in data.systems:
@@ -196,6 +201,7 @@ FIGURES = {
     "success": FigureKind("Success by condition, all families", ("main", "paper"), _success),
     "families": FigureKind("Success by condition and family", ("parts",), _families),
     "difficulty": FigureKind("Success by condition and difficulty", ("parts",), _difficulty),
+    "ability": FigureKind("Success by condition and ability", ("parts",), _ability, all_kinds=True),
     "retention": FigureKind(
         "Share of the lift that is left at the most sessions", ("effects",), forests.retention
     ),

@@ -5,8 +5,9 @@ from dataclasses import dataclass, replace
 
 from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.evaluate.score.scoring import Score, repeat_noise
+from robomme_interference_data.evaluate.score.tables.cells import part_kind
 from robomme_interference_data.evaluate.score.tables.contrast import LESSON_ONLY, Scope
-from robomme_interference_data.evaluate.score.tables.grids import family_grid
+from robomme_interference_data.evaluate.score.tables.grids import part_grid
 from robomme_interference_data.viz.tables import Table
 
 from .headline import headline
@@ -102,6 +103,8 @@ def _tables(score: Score, simulator: str) -> list[Table]:
     """Return the tables below the rates, those that have rows."""
     tables = {name: score.tables.get(name) for name in ("effects", "interaction", "equivalence")}
     primary = {"simulator": simulator, "primary": True}
+    cells = [cell for cell in score.cells if cell.simulator == simulator]
+    kinds = {part_kind(cell.part) for cell in cells if cell.n}
     views = [
         _view(
             rows_of(tables["effects"], **primary),
@@ -116,7 +119,7 @@ def _tables(score: Score, simulator: str) -> list[Table]:
             "Differences of falls between systems",
             "slope: points each time that the sessions double. difference: slope − against slope.",
         ),
-        family_grid([cell for cell in score.cells if cell.simulator == simulator]),
+        *(part_grid(cells, by) for by in ("family", "ability") if by in kinds),
         _view(
             [row for row in rows_of(score.tables["main"], simulator=simulator) if _repeated(row)],
             _RUNS,

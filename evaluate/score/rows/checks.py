@@ -70,7 +70,7 @@ class Checks:
     def check_together(self) -> None:
         """Leave out rows that do not fit the others, after all files are added."""
         self._check_alike("revision", ("simulator",), "rows of different buffer sets do not mix")
-        for column in ("difficulty", "seed", "chance"):
+        for column in ("difficulty", "ability", "seed", "chance"):
             self._check_alike(column, _EPISODE, "an episode has one")
         self._check_facts()
         # Last, because a row that was left out repeats none.

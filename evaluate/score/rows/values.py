@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, get_args, get_type_hints
 import pyarrow as pa
 
 from robomme_interference_data.constants import (
+    ABILITIES,
     DIFFICULTIES,
     MAX_STEPS,
     OFFICIAL,
@@ -48,6 +49,7 @@ class Row(NamedTuple):
     protocol_version: int
     seed: int | None
     difficulty: str | None
+    ability: str | None
     status: str
     success: bool | None
     steps: int | None
@@ -119,7 +121,7 @@ _SIMULATOR = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._:-]{0,127}")
 _WHOLE = re.compile(r"([0-9]{1,18})(?:\.0+)?")  # some programs save whole numbers as floats
 TRUTH = dict.fromkeys(("1", "true", "1.0"), True) | dict.fromkeys(("0", "false", "0.0"), False)
 _RANGES = {"steps": (0, MAX_STEPS), "protocol_version": (PROTOCOL_VERSION, PROTOCOL_VERSION)}
-_NAMES = {"split": SPLITS, "difficulty": DIFFICULTIES, "status": FINAL}
+_NAMES = {"split": SPLITS, "difficulty": DIFFICULTIES, "ability": ABILITIES, "status": FINAL}
 MAX_NUMBER = 10**18 - 1
 """The largest number of an episode or a seed, as in episode ids."""
 
@@ -143,7 +145,7 @@ def parse(name: str, value: Any) -> Any:
             raise ValueError("the revision of a buffer set")
         case "status" if text == Status.ONGOING:
             return str(Status.TIMEOUT)  # the released rows record a timeout as ongoing
-        case "split" | "difficulty" | "status":
+        case "split" | "difficulty" | "ability" | "status":
             if text not in _NAMES[name]:
                 raise InvalidOptionError.one_of(name, text, _NAMES[name])
         case "success" | "reads_history" | "reference":

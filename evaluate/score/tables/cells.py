@@ -1,4 +1,4 @@
-"""Rates of cells: system × condition, and the same by family and by difficulty."""
+"""Rates of cells: system × condition, and the same by family, difficulty and ability."""
 
 import math
 from collections import defaultdict
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from robomme_interference_data.constants import DIFFICULTIES
+from robomme_interference_data.constants import ABILITIES, DIFFICULTIES
 from robomme_interference_data.evaluate.score.outcomes import (
     ERROR,
     STATUSES,
@@ -35,7 +35,7 @@ class Coverage:
     simulator: str
     system: str
     condition: str
-    part: str  # family or difficulty; empty for all episodes
+    part: str  # family, difficulty or ability; empty for all episodes
     n: int  # episodes that count: at least one rollout that is not an error
     reference: bool = field(default=False, kw_only=True)  # the system is never ranked
     counts: tuple[int, ...] = field(default=(0,) * len(STATUSES), kw_only=True)  # by status
@@ -99,6 +99,13 @@ class SuccessCell(Coverage):
         return self.spread.deviation
 
 
+def part_kind(part: str) -> str:
+    """Return what a part is: `family`, `difficulty`, `ability`; empty for all episodes."""
+    if part in DIFFICULTIES:
+        return "difficulty"
+    return "ability" if part in ABILITIES else part and "family"
+
+
 def coverage_of(
     outcomes: Outcomes, system: int, condition: int, here: Flags, maybe_here: Flags
 ) -> dict[str, Any]:
@@ -121,8 +128,8 @@ def coverage_of(
 def cells_of(all_outcomes: Iterable[Outcomes]) -> list[SuccessCell]:
     """Return the cells of every system and condition, in the order of tables.
 
-    Each cell is followed by its parts by family and by difficulty. An expected episode of unknown
-    difficulty is missing in all three difficulties.
+    Each cell is followed by its parts by family, by difficulty and, in days, by ability. An
+    expected episode of unknown difficulty is missing in all three difficulties.
     """
     return [cell for outcomes in all_outcomes for cell in _cells(outcomes)]
 
@@ -134,9 +141,12 @@ def _cells(outcomes: Outcomes) -> list[SuccessCell]:
     for family in outcomes.families:
         here = outcomes.of_family(family)
         parts[family] = (here, here)
-    for place, difficulty in enumerate(DIFFICULTIES):
-        here = outcomes.difficulty == place
-        parts[difficulty] = (here, here | (outcomes.difficulty < 0))
+    for names, numbers in ((DIFFICULTIES, outcomes.difficulty), (ABILITIES, outcomes.ability)):
+        if names is ABILITIES and (numbers < 0).all():  # no days
+            continue
+        for place, name in enumerate(names):
+            here = numbers == place
+            parts[name] = (here, here | (numbers < 0))
     cells = []
     for s, c in np.argwhere(outcomes.in_tables).tolist():
         for part, (here, maybe_here) in parts.items():

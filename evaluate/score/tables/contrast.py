@@ -75,6 +75,8 @@ COMPARISONS = {
     "absent": Comparison(NO_HISTORY, "false memory"),
     "stale": Comparison("k", "updating"),
     "misled": Comparison(NO_HISTORY, "belief"),
+    "day": Comparison("day-cut", "borders"),
+    "day-cut": Comparison("day-alone", "the rest of the day"),
 }
 """Kind of condition to its comparison, with equally many sessions; in the order of tables."""
 

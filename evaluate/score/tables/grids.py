@@ -4,14 +4,13 @@ import math
 from collections.abc import Sequence
 from itertools import groupby
 
-from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.conditions import in_order
 from robomme_interference_data.viz.tables import Columns, Table, percent
 
 from . import action_error
-from .cells import SuccessCell
+from .cells import SuccessCell, part_kind
 from .main import BEST, NOTE
 
 NOT_EXPECTED = "n/a"
@@ -73,28 +72,28 @@ def _success(cell: SuccessCell | None, *, with_n: bool) -> str:
     return f"{rate}{cell.mark} [{100 * low:.1f}, {100 * high:.1f}]{n}{errors}"
 
 
-def family_grid(cells: Sequence[SuccessCell]) -> Table:
-    """Return the rates by family of one simulator: a row per system and family."""
-    own = [cell for cell in cells if cell.part and cell.part not in DIFFICULTIES]
+def part_grid(cells: Sequence[SuccessCell], by: str) -> Table:
+    """Return rates of one simulator: a row per system and part, a `family` or an `ability`."""
+    own = [cell for cell in cells if part_kind(cell.part) == by]
     conditions = [
         condition.name for condition in in_order({cell.condition for cell in own if cell.n})
     ]
     at = {(cell.system, cell.part, cell.condition): cell for cell in own}
     rows = []
-    for system, family in dict.fromkeys((cell.system, cell.part) for cell in own):
-        row_cells = [at.get((system, family, condition)) for condition in conditions]
-        rows.append([display_name(system), family, *map(_of_family, row_cells)])
+    for system, part in dict.fromkeys((cell.system, cell.part) for cell in own):
+        row_cells = [at.get((system, part, condition)) for condition in conditions]
+        rows.append([display_name(system), part, *map(_of_part, row_cells)])
     return Table(
         "parts",
-        "Success by family and condition",
-        dict.fromkeys(["system", "family", *conditions], "text"),
+        f"Success by {by} and condition",
+        dict.fromkeys(["system", by, *conditions], "text"),
         rows,
         "Intervals and complete counts are in the table parts. †: the cell is not complete.",
     )
 
 
-def _of_family(cell: SuccessCell | None) -> str:
-    """Return the rate of a family without its interval, n and errors."""
+def _of_part(cell: SuccessCell | None) -> str:
+    """Return the rate of a part without its interval, n and errors."""
     if cell is None:
         return NOT_EXPECTED
     errors = f", errors: {cell.errors}" if cell.errors else ""

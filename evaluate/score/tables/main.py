@@ -6,13 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from robomme_interference_data.constants import DIFFICULTIES
 from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.stats.bootstrap import Interval
 from robomme_interference_data.stats.runs import MIN_RUNS
 from robomme_interference_data.viz.tables import Columns, Table
 
-from .cells import EPISODES, SuccessCell, episodes_record
+from .cells import EPISODES, SuccessCell, episodes_record, part_kind
 from .comparison import record_table
 from .contrast import Contrast
 from .correction import primary_falls
@@ -128,27 +127,30 @@ def main_table(cells: Sequence[SuccessCell]) -> Table:
 def parts_table(
     cells: Sequence[SuccessCell], all_outcomes: Iterable[Outcomes], contrasts: Sequence[Contrast]
 ) -> Table:
-    """Return a row for each cell over a family, and over a difficulty; families come first."""
+    """Return a row for each cell over a family, a difficulty or an ability; families come first."""
     fall_of = {
         (fall.simulator, fall.system, fall.condition, family): record
         for outcomes in all_outcomes
         for fall in primary_falls(contrasts, outcomes.simulator)
         for family, record in _in_families(outcomes, fall)
     }
-    families, difficulties = list[dict[str, Any]](), list[dict[str, Any]]()
+    families, others = list[dict[str, Any]](), list[dict[str, Any]]()
     for cell in cells:
-        if cell.part in DIFFICULTIES:
+        by = part_kind(cell.part)
+        if by in ("difficulty", "ability"):
             record = _rate_record(cell) | _NO_FALL | episodes_record(cell, listed=False)
-            difficulties.append(record | {"by": "difficulty"})
-        elif cell.part:
+            others.append(record | {"by": by})
+        elif by == "family":
             fall = fall_of.get((cell.simulator, cell.system, cell.condition, cell.part), _NO_FALL)
             record = _rate_record(cell) | fall | episodes_record(cell, listed=True)
-            families.append(record | {"by": "family"})
+            families.append(record | {"by": by})
     notes = [NOTE, BEST, _PARTS_NOTE]
     if fall_of:
         notes.append(_FALLS_NOTE)
     title = "Success by family and by difficulty"
-    return record_table("parts", title, _PARTS, families + difficulties, " ".join(notes))
+    if any(record["by"] == "ability" for record in others):
+        title = "Success by family, by difficulty and by ability"
+    return record_table("parts", title, _PARTS, families + others, " ".join(notes))
 
 
 def _in_families(outcomes: Outcomes, fall: Contrast) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -44,6 +44,7 @@ SIDE = 0.036
 UPRIGHT = (math.sqrt(0.5), 0, math.sqrt(0.5), 0)
 """The rotation, as a quaternion, that stands up sapien's cylinders, which lie along x."""
 
+_ROOM = 2  # bodies of the room, which are built first
 _HIDDEN_Z = -0.5  # inside the table's block, where lamps wait until they are lit
 
 
@@ -82,6 +83,15 @@ class Body:
     def p(self) -> NDArray[np.float64]:
         """Position, `(3,) float64`."""
         return np.asarray(self._entity.pose.p, dtype=np.float64)
+
+    @property
+    def pose(self) -> "sapien.Pose":
+        """Position and rotation."""
+        return self._entity.pose
+
+    @pose.setter
+    def pose(self, pose: "sapien.Pose") -> None:
+        self._entity.set_pose(pose)
 
     def point(self, x: float, y: float, z: float) -> NDArray[np.float64]:
         """Convert a point from the body's own axes to the table's, `(3,) float64`."""
@@ -126,6 +136,11 @@ class SceneBuilder:
     def __init__(self, scene: Any):
         self._scene = scene
         self.bodies: list[Body] = []
+
+    @property
+    def things(self) -> list[Body]:
+        """The bodies on the table."""
+        return self.bodies[_ROOM:]
 
     def restore(self) -> None:
         """Return all bodies to their homes."""

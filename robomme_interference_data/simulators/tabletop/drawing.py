@@ -81,12 +81,17 @@ def draw_low_polygon(articulation: Any, stick: float) -> None:
             shape.set_local_pose(sapien.Pose([0, 0, 0], [0, 0, 0, 1]))
         body.attach(shape)
         if stick and part == "hand":
-            wood = material((0.30, 0.18, 0.08), 0.7, 0.2)
-            half = (stick + 0.04) / 2
-            rod = sapien.render.RenderShapeCylinder(ROD, half, wood)
-            rod.set_local_pose(sapien.Pose([0, 0, 0.1034 + stick - half], UPRIGHT))
-            body.attach(rod)
+            body.attach(stick_shape(stick))
         link.entity.add_component(body)
+
+
+def stick_shape(stick: float) -> Any:
+    """Return the shape of a stick of a length, in the axes of the hand that holds it."""
+    wood = material((0.30, 0.18, 0.08), 0.7, 0.2)
+    half = (stick + 0.04) / 2
+    rod = sapien.render.RenderShapeCylinder(ROD, half, wood)
+    rod.set_local_pose(sapien.Pose([0, 0, 0.1034 + stick - half], UPRIGHT))
+    return rod
 
 
 @lru_cache

@@ -1,7 +1,7 @@
 """The ManiSkill environment behind all nine families."""
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import sapien
@@ -20,7 +20,7 @@ from robomme_interference_data.schema.shifts import Shift
 from robomme_interference_data.schema.subgoal import Pixel, Subgoal
 from robomme_interference_data.simulators.episode import CAMERAS, Demonstration, Observation
 
-from .bodies import SceneBuilder
+from .bodies import Color, SceneBuilder
 from .camera import FRONT_EYE, FRONT_TARGET, FRONT_VIEW, SIZE, to_pixels
 from .drawing import PANDA, SHADER, draw_low_polygon
 from .episodes import difficulty_of, turn_of
@@ -45,6 +45,21 @@ _POSSIBLE: dict[str, tuple[Any, ...]] = {
 _POSSIBLE_BLIND = _POSSIBLE | {"obs_mode": ("none", "state", "state_dict"), "render_mode": (None,)}
 
 
+class Layout(Protocol):
+    """What stands on the table: an episode of a family, or a scene between two; see `Family`."""
+
+    table: Color
+    floor: Color
+    stick: float
+    pace: float
+
+    def build(self, builder: SceneBuilder) -> None:
+        """Build the bodies."""
+
+    def react(self, arm: Arm) -> None:
+        """Update the scene after a step."""
+
+
 class TabletopEnv(BaseEnv):  # type: ignore[misc]
     """One family's episodes: `reset(seed=s)` plays the demonstration of that seed's episode.
 
@@ -64,6 +79,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         frame_step: They render every n-th frame of it.
         demonstrating: Whether a reset plays the demonstration at all.
         shift: Shift of the live scene.
+        table: Color of every table; None for each family's own.
     """
 
     SUPPORTED_ROBOTS = [PANDA]  # noqa: RUF012, ManiSkill's name and type
@@ -76,6 +92,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self.frame_step = 1
         self.demonstrating = False
         self.shift: Shift | None = None
+        self.table: Color | None = None
         self._scene_shift: SceneShift | None = None  # of the running episode, once it has a shift
         for name, values in (_POSSIBLE if render else _POSSIBLE_BLIND).items():
             if options.setdefault(name, values[0]) not in values:
@@ -101,12 +118,12 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
     def _load_agent(self, options: dict[str, Any]) -> None:
         super()._load_agent(options, sapien.Pose(BASE))
         if self.scene.can_render():
-            draw_low_polygon(self.agent.robot._objs[0], self.episode.stick)
+            draw_low_polygon(self.agent.robot._objs[0], self.layout.stick)
 
     def _load_scene(self, options: dict[str, Any]) -> None:
         self.builder = SceneBuilder(self.scene)
-        self.builder.room(self.episode.table, self.episode.floor)
-        self.episode.build(self.builder)
+        self.builder.room(self.table or self.layout.table, self.layout.floor)
+        self.layout.build(self.builder)
 
     def _load_lighting(self, options: dict[str, Any]) -> None:
         self.scene.set_ambient_light([0.45, 0.45, 0.45])
@@ -114,14 +131,14 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self.scene.add_directional_light([0.4, -0.7, -0.6], [0.25, 0.25, 0.28])
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
-        self.arm = Arm(self.agent.robot._objs[0], self.episode.pace, self.episode.stick)
+        self.arm = Arm(self.agent.robot._objs[0], self.layout.pace, self.layout.stick)
         self.status = Status.ONGOING
         self._scripts: dict[str, Script] = {}
         self._follower: SubgoalFollower | None = None
-        self._rest()
+        self.rest()
 
     def _after_control_step(self) -> None:
-        self.episode.react(self.arm)
+        self.layout.react(self.arm)
 
     def evaluate(self) -> dict[str, torch.Tensor]:
         """Return `success` and `fail` as ManiSkill expects them."""
@@ -136,7 +153,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         self, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Start the episode of a seed: play its demonstration, then set up the live scene."""
-        options = dict(options or {}, reconfigure=True)  # nothing else is reproducible
+        options = options or {}
         if seed is None:
             seed = int(self._main_rng.randint(2**31))
         number = _index(np.ravel(seed)[0], 0, 2**32, "seed")
@@ -148,8 +165,7 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         answer = _index(options.get("answer", turn_of(number, count)), -count, count, "answer")
         self.number, self.episode, self.answer = number, episode, answers[answer]
         self.guess = answers[turn_of(number, count, stream=1)]
-        observed, info = super().reset(seed=number, options=options)
-        self._scene_shift = None
+        observed, info = self.load(episode, number, options)
         if self.demonstrating:
             info["demonstration"] = self._demonstrate()
             if self.shift is not None:
@@ -158,6 +174,15 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
         goal = episode.goal
         info.update(goal=goal, goals=(goal,), difficulty=difficulty)
         return observed, info
+
+    def load(
+        self, layout: Layout, seed: int = 0, options: Mapping[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Build what stands on the table, with the arm at its home pose, at rest."""
+        self.layout, self._scene_shift = layout, None
+        options = dict(options or {}, reconfigure=True)  # nothing else is reproducible
+        loaded: tuple[Any, dict[str, Any]] = super().reset(seed=seed, options=options)
+        return loaded
 
     def _step_action(self, action: Any) -> Any:
         done = super()._step_action(action)
@@ -180,6 +205,10 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
             self.arm.reset()
             self._scripts[policy] = self.episode.solve(self.arm, chosen)
         next(self._scripts[policy], None)  # a finished script holds its last pose
+        return self.arm.action.copy()
+
+    def hold(self) -> NDArray[np.float32]:
+        """Return the last commanded action once more, `(8,) float32`."""
         return self.arm.action.copy()
 
     def subgoal(self) -> Subgoal:
@@ -218,8 +247,11 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
                 images[name] = np.ascontiguousarray(camera.get_picture("Color")[..., :3])
         return Observation(images, self.arm.state)
 
-    def show(self, shift: Shift | None) -> None:
-        """Apply a shift to the live scene from now on; None for no shift."""
+    def show(self, shift: Shift | None, seed: int | None = None) -> None:
+        """Apply a shift from now on; None for no shift.
+
+        `seed` is that of a new scene's shifts, by default the episode's.
+        """
         if not self.drawing or (shift is None and self._scene_shift is None):
             return
         if self._scene_shift is None:
@@ -227,7 +259,8 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
             from .scene_shift import SceneShift
 
             cameras = {name: self._camera(name) for name in CAMERAS}
-            self._scene_shift = SceneShift(self.scene.sub_scenes[0], cameras, self.number)
+            seed = self.number if seed is None else seed
+            self._scene_shift = SceneShift(self.scene.sub_scenes[0], cameras, seed)
         self._scene_shift.show(shift)
 
     def render_rgb_array(self, camera_name: str | None = None) -> torch.Tensor:
@@ -238,15 +271,22 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
     def _camera(self, name: str) -> Any:
         return self._sensors[name].camera._render_cameras[0]
 
+    def execute(self, script: Script) -> Iterator[NDArray[np.float32]]:
+        """Execute a script, and judge nothing; yield each action, `(8,) float32`, before it."""
+        for _ in script:
+            action = self.arm.action.copy()
+            yield action
+            super()._step_action(action)
+
     def _demonstrate(self) -> Demonstration:
         seen, actions, shown = [], [], []
-        for number, _ in enumerate(self.episode.demonstrate(self.arm, self.answer)):
+        script = self.episode.demonstrate(self.arm, self.answer)
+        for number, action in enumerate(self.execute(script)):
             shown.append(self.episode.showing)
             seen.append(self.observe(() if number % self.frame_step else self.demonstrated))
-            actions.append(self.arm.action.copy())
-            super()._step_action(actions[-1])
+            actions.append(action)
         self.builder.restore()
-        self._rest()
+        self.rest()
         return Demonstration(
             {
                 name: np.stack(
@@ -259,12 +299,12 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
             spans_of_parts(shown, self.episode.parts(self.answer)),
         )
 
-    def _rest(self) -> None:
+    def rest(self) -> None:
         """Set the arm to its home pose, at rest."""
         self.arm.reset()
         robot = self.agent.robot._objs[0]
         qpos = np.array(self.arm.home_qpos, dtype=np.float32)
-        qpos[7:] = 0.0 if self.episode.stick else 0.04
+        qpos[7:] = 0.0 if self.layout.stick else 0.04
         robot.set_qpos(qpos)
         robot.set_qvel(np.zeros_like(qpos))
         self.agent.controller.reset()

@@ -39,6 +39,7 @@ SPEED = 0.25  # m/s, at the middle of a move
 SLOW = 0.12  # m/s, close to objects
 TURN = 1.2  # rad/s
 CLEARANCE = 0.10  # m above an object before the gripper goes down to it
+_SAFE = 0.18  # m above the table, higher than what stands on it
 SETTLE = 3  # time steps until the arm has caught up with its command
 GRIP = 5  # time steps until the fingers have closed or opened
 
@@ -89,6 +90,11 @@ class Arm:
     def opening(self) -> float:
         """Distance that one finger is open, 0 to 0.04 m."""
         return float(self._robot.qpos[7])
+
+    @property
+    def commanded(self) -> tuple[NDArray[np.float64], float]:
+        """Commanded position, `(3,) float64` in m, and yaw in rad."""
+        return self._goal, self._yaw
 
     # --- scripts ---------------------------------------------------------------------------------
 
@@ -190,13 +196,19 @@ class Arm:
 
     def go_home(self) -> Script:
         """Move up, then to the home pose, and open the gripper."""
-        yield from self.rise(0.18)
+        yield from self.rise(_SAFE)
         yield from self.move(HOME, 0.0)
         self._qpos = self.home_qpos  # without the elbow's angle, which depends on the way
         self._command()
         if not self._stick and self._gripper < 0:
             yield from self.grip(close=False)
         yield from self.wait(SETTLE)
+
+    def leave_home(self, to: Point, yaw: float) -> Script:
+        """Move from the home pose to a point, the last part straight down."""
+        x, y, z = to
+        yield from self.move((x, y, max(z, _SAFE)), yaw)
+        yield from self.move(to, yaw, SLOW)
 
     # --- inverse kinematics ----------------------------------------------------------------------
 
