@@ -146,9 +146,9 @@ def condition_pages() -> Iterator[str]:
     yield (
         "A condition names the history that a policy gets before a query episode. `no-history` "
         "and `k0`, `k1`, `k3`, `k7` are the paper's; the others are additions of this project. "
-        "`<n>` is the number of distractor units, 0 to 63. Units are nested in `n`, and the same "
-        "in every row but `same-k<n>`. The table `effects` of a score compares a condition with "
-        "that of the last column, with as many units.\n"
+        "`<n>` is the number of distractor units, 0 to 63, of a day that of tasks. Units are "
+        "nested in `n`, and the same in every row but `same-k<n>`. The table `effects` of a "
+        "score compares a condition with that of the last column, with as many units.\n"
     )
     rows = []
     for kind in KINDS.values():

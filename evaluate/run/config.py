@@ -120,7 +120,9 @@ class RunConfig(WorkConfig):
         group=_SIMULATOR,
         help="Compare actions with those of the buffer set's executions, without a simulator.",
     )
-    simulator: str = setting("tabletop", group=_SIMULATOR, help="tabletop, robomme or module:name.")
+    simulator: str = setting(
+        "tabletop", group=_SIMULATOR, help="tabletop, tabletop-day, robomme or module:name."
+    )
     simulator_python: str | None = setting(
         None, group=_SIMULATOR, metavar="PATH", help=PYTHON_HELP, shown=PYTHON_SHOWN
     )

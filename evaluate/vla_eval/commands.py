@@ -19,7 +19,9 @@ def vla_eval_config(
     episodes: Annotated[
         str | None, typer.Option(help="Episode numbers, such as 0-49; default: all.")
     ] = None,
-    simulator: Annotated[str, typer.Option(help="tabletop, robomme or module:name.")] = "tabletop",
+    simulator: Annotated[
+        str, typer.Option(help="tabletop, tabletop-day, robomme or module:name.")
+    ] = "tabletop",
     url: Annotated[str, typer.Option(help="Address of the server.")] = "ws://localhost:8000",
     output_dir: Annotated[str, typer.Option(help="Folder of vla-eval's results.")] = "results",
     out: Annotated[Path | None, typer.Option(help="File to write; default: print it.")] = None,

@@ -35,7 +35,7 @@ def simulate(
     video: Annotated[Path | None, _option("Output", "Write a video to this .mp4 file.")] = None,
     as_json: AsJson = False,
     simulator: Annotated[
-        str, _option("Simulator", "tabletop, robomme or module:name.")
+        str, _option("Simulator", "tabletop, tabletop-day, robomme or module:name.")
     ] = "tabletop",
     simulator_python: Annotated[
         str | None, _option("Simulator", PYTHON_HELP, metavar="PATH", show_default=PYTHON_SHOWN)

@@ -175,6 +175,7 @@ def robots(folder: Path) -> None:
 PREPARED: dict[str, Callable[[Path], None]] = {
     "another-benchmark.md": nothing,
     "compare-systems.md": scored,
+    "days.md": nothing,
     "publish.md": recorded,
     "real-robots.md": robots,
     "retrieval.md": nothing,
@@ -222,7 +223,7 @@ def stand_ins(hub: Any, login: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)  # of retrieval.md: it builds from the simulator
+@pytest.mark.timeout(1200)  # of retrieval.md and days.md: they build from the simulator
 @pytest.mark.parametrize("page", PAGES)
 def test_a_page_runs_from_top_to_bottom(
     page: str,
@@ -236,7 +237,8 @@ def test_a_page_runs_from_top_to_bottom(
     folder.mkdir()
     monkeypatch.chdir(folder)
     PREPARED.get(page, golden)(folder)
-    monkeypatch.setenv(worlds.BUFFER_SET, str(folder / "my-buffers"))
+    built = "my-days" if page == "days.md" else "my-buffers"
+    monkeypatch.setenv(worlds.BUFFER_SET, str(folder / built))
     push_buffer_set(hub, GOLDEN, tmp_path / "work", "namespace/name")
     names: dict[str, Any] = {}
     steps = [*steps_of((HOW_TO / page).read_text(encoding="utf-8"))]

@@ -1,0 +1,334 @@
+"""Days in a buffer set: what is stored, which buffers are spans of it, and what `verify` finds.
+
+On days of a simulator without physics; `docs/how-to/days.md` builds one on the embedded simulator,
+which `system/test_how_to.py` runs.
+"""
+
+import hashlib
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from support import days
+from support.buffer_sets import contents, dataset, plan_again
+from support.damage import edit, put, renew_header
+from support.days import CONDITIONS, IDLE, build_days, lesson, plan_of, playing_days
+from support.hub_server import HubServer
+from support.messages import raises
+from support.publishing import UNITS, plain_cards, publish
+from support.verifying import expect
+
+from robomme_interference_data import load_buffer, load_buffer_set
+from robomme_interference_data.build_dataset.dataset.build import build_dataset
+from robomme_interference_data.cards.dataset_facts import buffer_set_facts
+from robomme_interference_data.cards.publication import Publication
+from robomme_interference_data.cards.render import card_text
+from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
+from robomme_interference_data.progress import WorkProgress
+from robomme_interference_data.runtime.executor import Serial
+from robomme_interference_data.schema.records import DaySpan
+
+RECORDS = "days/meta/interference.parquet"
+UPDATE, PIECES, ABSENT = "VideoPlaceButton/test/0", "VideoPlaceButton/test/2", "VideoUnmask/test/0"
+QUIET = WorkProgress(quiet=True)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("days") / "buffers"
+    build_days(folder)
+    return folder
+
+
+@pytest.fixture
+def own(root: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(root, tmp_path / "buffers"))
+
+
+def frames_of(span: DaySpan) -> Any:
+    """The images that a span must show."""
+    if span.part == "transition":
+        return np.full((span.stop - span.start, 32, 32, 3), 255, np.uint8)
+    if span.part == "idle":
+        return np.zeros((IDLE, 32, 32, 3), np.uint8)
+    piece = {"lesson": slice(6), "first": slice(3), "second": slice(3, 6)}[span.part]
+    return lesson(span.source)[piece]
+
+
+# --- what is stored -----------------------------------------------------------------------------
+
+
+def test_spans_are_the_day_frame_by_frame(root: Path) -> None:
+    held = dataset(root, "days")
+    assert [str(record.episode_id) for record in held.records()] == ["Day8/test/0", "Day8/test/2"]
+    for record in held.records():
+        assert record.day is not None
+        frames = np.stack([*held.iter_frames(record.episode_index, "front", 0, record.length)])
+        states = np.repeat(np.arange(record.length, dtype=np.float32)[:, None], 8, 1)
+        stop = 0
+        for span in record.day.spans:
+            assert span.start == stop
+            stop = span.stop
+            assert np.array_equal(frames[span.start : stop], frames_of(span))
+            digests = {
+                name: hashlib.sha256(values[span.start : stop].tobytes()).hexdigest()
+                for name, values in (
+                    ("observation.images.front", frames),
+                    ("observation.state", states),
+                )
+            }
+            text = json.dumps(digests, sort_keys=True, separators=(",", ":"))
+            assert span.sha256 == hashlib.sha256(text.encode()).hexdigest()
+        assert stop == record.length
+
+
+def test_queries_have_their_abilities(root: Path) -> None:
+    abilities = {
+        str(record.episode_id): record.ability
+        for record in dataset(root, "demonstrations").records()
+    }
+    assert abilities == {
+        "VideoRepick/test/0": "recall",
+        "VideoPlaceOrder/test/0": "recall",
+        "VideoPlaceButton/test/0": "update",
+        "VideoPlaceButton/test/2": "several",
+        "VideoUnmask/test/0": "absent",
+        "VideoUnmask/test/2": "update",
+    }
+    for name in ("days", "distractors"):
+        assert {record.ability for record in dataset(root, name).records()} == {None}
+
+
+def test_lerobot_opens_the_days(root: Path) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    opened = LeRobotDataset("any/name", root=root / "days", video_backend="pyav")
+    record = dataset(root, "days").record(0)
+    assert opened.num_episodes == 2 and record.day is not None
+    span = next(span for span in record.day.spans if span.part == "lesson")
+    item = opened[span.start + 1]
+    image = (item["observation.images.front"].permute(1, 2, 0) * 255).round().byte().numpy()
+    assert np.array_equal(image, lesson(span.source)[1])
+    assert item["task"] == "do the 8 tasks of the day"
+
+
+# --- buffers ------------------------------------------------------------------------------------
+
+
+def test_buffers_are_spans_of_the_day(root: Path) -> None:
+    """The day's own plan is held by `core/test_days.py`."""
+    sessions = {
+        (str(manifest.episode_id), manifest.condition): [
+            (entry.role, str(entry.source), entry.start, entry.stop) for entry in manifest.sessions
+        ]
+        for manifest in load_buffer_set(root).manifests()
+    }
+    assert [role for role, *_ in sessions[UPDATE, "day-k2"]][1::2] == [
+        "distractor",
+        "contradiction",
+        "lesson",
+        "distractor",
+        "distractor",
+    ]
+    for query, condition in sessions:
+        if condition != "day-k2":
+            continue
+        short, long, cut_short, cut_long, alone = (
+            sessions[query, name]
+            for name in ("day-k0", "day-k2", "day-cut-k0", "day-cut-k2", "day-alone")
+        )
+        assert long[: len(short)] == short and len(long) == len(short) + 4
+        assert cut_short == [entry for entry in short if entry[0] != "transition"]
+        assert cut_long == [entry for entry in long if entry[0] != "transition"]
+        assert alone == [entry for entry in short if entry[0] in ("lesson", "contradiction")]
+        assert [entry[0] for entry in long[::2]] == ["transition"] * (len(long) // 2)
+        # Without a border: every session begins where the last one ends.
+        assert [entry[2] for entry in long] == [0, *(entry[3] for entry in long[:-1])]
+        assert (alone == []) == (query == ABSENT)
+        assert sessions[query, "no-history"] == []
+    assert [entry[:2] for entry in sessions[PIECES, "day-alone"]] == [("lesson", PIECES)] * 2
+
+
+@pytest.mark.parametrize("condition", ["day-k0", "day-cut-k2", "day-alone"])
+def test_a_buffer_shows_its_spans(root: Path, condition: str) -> None:
+    buffer = load_buffer(PIECES, condition, buffer_set=root, verify=True)
+    day = dataset(root, "days").record(1).day
+    assert day is not None
+    spans = {span.start: span for span in day.spans}
+    expected = [frames_of(spans[entry.start]) for entry in buffer.manifest.sessions]
+    assert np.array_equal(buffer.frames("front"), np.concatenate(expected))
+    chunks = [*buffer.stream(chunk=7)]
+    streamed = np.concatenate([chunk.frames["front"] for chunk in chunks])
+    assert np.array_equal(streamed, buffer.frames("front"))
+    assert np.array_equal(np.concatenate([chunk.states for chunk in chunks]), buffer.states)
+    assert buffer.manifest.lesson_frames == 6
+
+
+def test_its_card_counts_the_days(root: Path) -> None:
+    card = card_text(buffer_set_facts(load_buffer_set(root)), Publication("a/b", "1.0.0"))
+    assert "days" in card and "day-cut-k2" in card
+
+
+# --- what is refused ----------------------------------------------------------------------------
+
+
+def test_no_lesson_without_one_before_anything_is_built(tmp_path: Path, run: Any) -> None:
+    out = tmp_path / "buffers"
+    code, _, err = run(
+        *("build", out, "--source", "tabletop-day:8", "--split", "test", "--episodes", "0"),
+        *("--unit-episodes", "0", "--conditions", "k0,day-k0"),
+    )
+    assert code == 1 and ABSENT in err and "day-k0" in err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("conditions", "limit", "error"),
+    [
+        (("k0",), None, BuildError),  # one of the queries has no lesson
+        (("day-k63",), None, BuildError),
+        (("day-k2",), 1400, InvalidOptionError),  # of 229 frames and 1300 steps
+    ],
+)
+def test_what_days_do_not_hold_is_not_planned(
+    own: Path, conditions: tuple[str, ...], limit: int | None, error: type[Exception]
+) -> None:
+    before = contents(own)
+    with raises(error):
+        plan_again(own, conditions, position_limit=limit)
+    assert contents(own) == before
+
+
+def test_days_that_lack_a_query(own: Path) -> None:
+    shutil.rmtree(own / "days")
+    with playing_days():
+        build_dataset(plan_of("days", (0,)), own / "days", Serial(), QUIET)
+    with raises(SourceError):
+        plan_again(own, CONDITIONS)
+
+
+def test_no_such_number_of_tasks(tmp_path: Path, run: Any) -> None:
+    code, _, err = run("build", tmp_path / "buffers", "--source", "tabletop-day:7")
+    assert code == 1 and "8 to 60" in err
+
+
+# --- verify -------------------------------------------------------------------------------------
+
+
+def changed_day(root: Path, change: Any) -> None:
+    """Change the first day's record, which is stored twice."""
+
+    def changed(table: pa.Table) -> pa.Table:
+        values = table["day"].to_pylist()
+        values[0] = change(values[0])
+        return put(table, "day", values)
+
+    for path in (RECORDS, "days/meta/episodes/chunk-000/file-000.parquet"):
+        edit(root / path, changed)
+
+
+def earlier(day: dict[str, Any]) -> dict[str, Any]:
+    day["spans"][0]["stop"] -= 1
+    return day
+
+
+def exchanged(day: dict[str, Any]) -> dict[str, Any]:
+    first, second, *_ = day["spans"]
+    first["sha256"], second["sha256"] = second["sha256"], first["sha256"]
+    return day
+
+
+def outside(day: dict[str, Any]) -> dict[str, Any]:
+    seen = next(span for span in day["spans"] if span["evidence"])
+    seen["evidence"][0]["stop"] = seen["stop"] + 1
+    return day
+
+
+def too_late(day: dict[str, Any]) -> dict[str, Any]:
+    day["queries"][0]["task"] = 8
+    return day
+
+
+@pytest.mark.parametrize(
+    ("change", "pattern"),
+    [
+        (earlier, "days Day8/test/0: its spans are not its"),
+        (exchanged, "days Day8/test/0: frames 0 to 10 do not have the recorded SHA-256"),
+        (outside, "days Day8/test/0: evidence of .* is outside of its frames"),
+        (too_late, "days Day8/test/0: VideoRepick/test/0 is asked after task 8 of 8"),
+        (lambda day: None, "days Day8/test/0: has no tasks"),
+    ],
+)
+def test_a_changed_day_is_found(own: Path, change: Any, pattern: str) -> None:
+    changed_day(own, change)
+    expect(own, pattern, decode=change is exchanged)
+
+
+def test_a_buffer_with_another_role_is_found(own: Path) -> None:
+    """The update as if it were the old lesson."""
+
+    def change(table: pa.Table) -> pa.Table:
+        rows = table["sessions"].to_pylist()
+        for sessions in rows:
+            for entry in sessions:
+                if entry["role"] == "contradiction":
+                    entry["role"] = "distractor"
+        return put(table, "sessions", rows)
+
+    edit(own / "manifests/buffers.parquet", change)
+    renew_header(own)
+    expect(own, f"{UPDATE} under day-k0: sessions is .*; the rules give .*contradiction")
+
+
+# --- the same bytes -----------------------------------------------------------------------------
+
+
+def test_a_build_that_was_stopped_gives_the_same_bytes(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The last day first, the other one interrupted in its middle and built later."""
+    plan, played = plan_of("days"), []
+    plan = replace(plan, episodes=plan.episodes[::-1])
+    frames = days.PlayedDouble.frames
+
+    def stopping(self: Any) -> Any:
+        played.append(str(self.plan.day))
+        for number, frame in enumerate(frames(self)):
+            if len(played) == 2 and number == 30:
+                raise KeyboardInterrupt
+            yield frame
+
+    monkeypatch.setattr(days.PlayedDouble, "frames", stopping)
+    with playing_days():
+        with pytest.raises(KeyboardInterrupt):
+            build_dataset(plan, tmp_path / "days", Serial(), QUIET)
+        assert not (tmp_path / "days").exists()
+        build_dataset(plan, tmp_path / "days", Serial(), QUIET)
+    assert played == ["Day8/test/2", "Day8/test/0", "Day8/test/0"]
+    assert contents(tmp_path / "days") == contents(root / "days")
+
+
+# --- published ----------------------------------------------------------------------------------
+
+
+def test_of_published_days_only_the_one_that_is_loaded_is_downloaded(
+    root: Path, hub: HubServer, login: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    login("someone")
+    plain_cards(monkeypatch)
+    publish(root)
+    hub.requests.clear()
+    theirs = load_buffer(PIECES, "day-k0", buffer_set=UNITS, verify=True)
+    mine = load_buffer(PIECES, "day-k0", buffer_set=root)
+    assert theirs.manifest == mine.manifest
+    assert np.array_equal(theirs.frames("front"), mine.frames("front"))
+    videos = [path for path in hub.downloads() if path.endswith(".mp4")]
+    assert sorted(videos) == [  # the second day, and the first live observation
+        "days/videos/observation.images.front/chunk-000/file-001.mp4",
+        "videos/observation.images.front/chunk-000/file-003.mp4",
+    ]

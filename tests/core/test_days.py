@@ -1,0 +1,175 @@
+"""Plans of days: fixed for their rule version, and with the properties that they claim."""
+
+import os
+import subprocess
+import sys
+from collections import Counter
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.messages import raises
+
+from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.errors import InvalidIdError
+from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.schema.days import (
+    ABILITIES,
+    TASKS,
+    DayPlan,
+    ability_of,
+    day_id,
+    day_tasks,
+    goal_in_day,
+    plan_day,
+    queries_of,
+    query_indices,
+)
+
+OTHERS = [EpisodeId(family, "train", index) for family in FAMILIES for index in range(20)]
+
+
+def plan(tasks: int, index: int, others: list[EpisodeId] = OTHERS) -> DayPlan:
+    return plan_day(day_id(tasks, "test", index), others, lambda episode: 1)
+
+
+def lines(planned: DayPlan) -> list[str]:
+    return [
+        f"{task.episode} {task.part} {task.shift} {task.transition}" for task in planned.tasks
+    ] + [f"{query.episode} {query.task}" for query in planned.queries]
+
+
+SHIFTED_DAY = [
+    "VideoUnmask/test/2/1 lesson light:2 29",
+    "VideoUnmask/test/2 lesson light:2 24",
+    "VideoPlaceButton/test/2 first light:2 22",
+    "VideoPlaceButton/test/2 second light:2 11",
+    "MoveCube/train/17 lesson none 15",
+    "VideoUnmask/train/1 lesson none 28",
+    "RouteStick/train/2 lesson none 17",
+    "VideoRepick/train/11 lesson none 18",
+    "VideoPlaceButton/test/2 3",
+    "VideoUnmask/test/2 1",
+]
+"""The third day of eight tasks under rule version 1. It must never change: another rule needs
+another version."""
+
+
+def test_a_planned_day_never_changes() -> None:
+    assert lines(plan(8, 2)) == SHIFTED_DAY
+
+
+PRINT = """
+from core.test_days import lines, plan
+print("\\n".join(lines(plan(8, 2))))
+"""
+
+
+def test_it_is_the_same_under_another_hash_seed() -> None:
+    environment = os.environ | {"PYTHONHASHSEED": "7", "PYTHONPATH": "tests"}
+    done = subprocess.run(
+        [sys.executable, "-c", PRINT], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines() == SHIFTED_DAY
+
+
+@given(st.sampled_from(TASKS), st.integers(0, 30), st.randoms(use_true_random=False))
+def test_every_plan(tasks: int, index: int, chance: object) -> None:
+    planned, early = plan(tasks, index), tasks - tasks // 4
+    assert len(planned.tasks) == tasks
+    queries = {query.episode: query.task for query in planned.queries}
+    assert list(queries) == sorted(queries_of(planned.day)) and len(queries) >= 2
+    played: dict[EpisodeId, list[tuple[int, int | None, str]]] = {query: [] for query in queries}
+    others = []
+    for number, task in enumerate(planned.tasks):
+        assert 10 <= task.transition <= 30
+        if task.episode is not None and task.episode.scene in played:
+            played[task.episode.scene].append((number, task.episode.answer, task.part))
+        else:
+            others.append(task.episode)
+            assert task.part == ("idle" if task.episode is None else "lesson")
+    for query, lessons in played.items():
+        assert [lesson[1:] for lesson in lessons] == {
+            "recall": [(None, "lesson")],
+            "several": [(None, "first"), (None, "second")],
+            "update": [(1, "lesson"), (None, "lesson")],
+            "order-last": [(1, "lesson"), (None, "lesson")],
+            "order-first": [(None, "lesson"), (1, "lesson")],
+            "absent": [],
+        }[ability_of(query)]
+        if lessons:
+            assert queries[query] == lessons[-1][0]
+        assert 0 <= queries[query] < early  # so that at least tasks // 4 follow
+    known = [episode for episode in others if episode is not None]
+    assert set(known) <= set(OTHERS) and len(set(known)) == len(known)
+    counts = Counter(episode.family for episode in known)
+    assert max(counts.values()) - min(counts[family] for family in FAMILIES) <= 1
+    assert len(others) - len(known) == len(others) // 5
+
+    shuffled = list(OTHERS)
+    chance.shuffle(shuffled)  # type: ignore[attr-defined]
+    assert plan(tasks, index, shuffled) == planned
+
+
+@given(st.sampled_from(TASKS), st.integers(0, 30), st.integers(1, 5))
+def test_days_share_no_query(tasks: int, index: int, later: int) -> None:
+    days = [day_id(tasks, "test", number) for number in (index, index + later)]
+    assert not set(queries_of(days[0])) & set(queries_of(days[1]))
+    assert query_indices(days[0]).stop <= query_indices(days[1]).start
+
+
+def test_twelve_days_of_thirty_tasks_ask_of_every_ability() -> None:
+    queries = [query for day in range(12) for query in queries_of(day_id(30, "test", day))]
+    assert len(queries) == 12 * 12
+    counts = Counter(map(ability_of, queries))
+    assert {ability: counts[ability] for ability in ABILITIES} == {
+        "recall": 40,
+        "several": 19,
+        "update": 36,
+        "order-first": 13,
+        "order-last": 13,
+        "absent": 23,
+    }
+
+
+@pytest.mark.parametrize(
+    ("query", "ability"),
+    [  # VideoRepick is family 0, PatternLock, whose lessons show several parts, family 7
+        ("VideoRepick/test/0", "recall"),
+        ("VideoRepick/train/1", "update"),
+        ("VideoRepick/test/2", "order-first"),  # 2 // 6 is even
+        ("VideoRepick/test/8", "order-last"),  # 8 % 6 is 2, 8 // 6 is odd
+        ("VideoRepick/test/3", "absent"),
+        ("PatternLock/test/5", "several"),  # (7 + 5) % 6 is 0
+        ("PatternLock/test/3", "several"),  # (7 + 3) % 6 is 4
+        ("PatternLock/test/4", "order-first"),
+    ],
+)
+def test_what_a_query_needs_follows_from_its_id(query: str, ability: str) -> None:
+    assert ability_of(EpisodeId.parse(query)) == ability
+
+
+def test_the_goal_says_which_lesson_counts_if_the_order_matters() -> None:
+    first, last, update = (EpisodeId("VideoRepick", "test", index) for index in (2, 8, 1))
+    assert goal_in_day(first, "lift it") == "lift it, as it was shown the first time"
+    assert goal_in_day(last, "lift it") == "lift it, as it was shown the last time"
+    assert goal_in_day(update, "lift it") == "lift it"
+
+
+def test_every_third_day_looks_different_until_half_of_it_is_done() -> None:
+    shifts = {
+        index: [task.shift for task in plan(9, index).tasks] for index in (0, 1, 2, 3, 5, 8, 11)
+    }
+    assert shifts == {
+        **dict.fromkeys((0, 1, 3), ["none"] * 9),
+        **{
+            index: [f"{kind}:2"] * 4 + ["none"] * 5
+            for index, kind in ((2, "light"), (5, "camera"), (8, "clutter"), (11, "light"))
+        },
+    }
+
+
+@pytest.mark.parametrize("name", ["Day7/test/0", "Day61/test/0", "Day08/test/0", "MoveCube/test/0"])
+def test_what_is_not_a_day(name: str) -> None:
+    with raises(InvalidIdError):
+        day_tasks(EpisodeId.parse(name))
