@@ -47,7 +47,8 @@ def make_questions(buffer_set: BufferSet) -> Iterator[Question]:
                 f"the first live observation of {question.episode_id} has "
                 f"{view.shape[1]}×{view.shape[0]} pixels; expected {side}×{side}, in which the "
                 "positions of objects are known",
-                "Build the demonstrations with the simulator itself.",
+                "Build the demonstrations with the simulator itself and without `resize`; training "
+                "resizes frames by itself (`image_size`).",
             )
         yield replace(question, picture=png(picture(view, marks)))
 

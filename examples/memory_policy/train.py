@@ -21,7 +21,7 @@ from memory_model import POSITIONS, Config, MemoryModel, on_device, save_checkpo
 from torch.nn import functional
 from torch.utils.data import DataLoader
 
-from robomme_interference_data import load_buffer_set
+from robomme_interference_data import BufferSet, load_buffer_set
 from robomme_interference_data.constants import CAMERA_PREFIX
 from robomme_interference_data.errors import FormatError, InvalidOptionError
 from robomme_interference_data.storage.files import atomic_path
@@ -78,46 +78,11 @@ def main(args: argparse.Namespace) -> None:
     settings = {name: value for name, value in vars(args).items() if name not in other}
     settings |= {"data": buffer_set.revision}
     state = resume(args.out, settings)
-    data = HistoryDataset(
-        buffer_set,
-        args.conditions,
-        memory=args.memory,
-        cameras=args.cameras,
-        image_size=args.image_size,
-        chunk=args.chunk if args.task == "act" else 0,
-        split=args.split,
-        families=args.families,
-        episodes=args.episodes,
-        retrieval=args.retrieval,
-        questions=args.task == "answer",
-        redraw=args.redraw,
-        unit_episodes=args.unit_episodes,
-        seed=args.seed,
-    )
+    data = make_data(buffer_set, args)
     print(data)
     args.out.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(args.seed)
-    item = data[0]
-    config = Config(
-        task=args.task,
-        data=buffer_set.revision,
-        memory=args.memory,
-        cameras=tuple(name.removeprefix(CAMERA_PREFIX) for name in data.cameras),
-        image_size=args.image_size,
-        points=item["question.points"].shape[1] if args.task == "answer" else 1,
-        state=len(item["observation.state"]),
-        action=item["action"].shape[1] if args.task == "act" else 8,
-        chunk=args.chunk,
-        width=args.width,
-        layers=args.layers,
-        attention_dropout=not args.no_attention_dropout,
-        trunk=args.trunk,
-        pictures=not args.no_pictures,
-        positions=args.positions,
-        seed=args.seed,
-        training_steps=args.steps,
-    )
-    model = MemoryModel(config)
+    model = MemoryModel(make_config(data, args))
     if args.task == "act":
         model.fit_scales(data[[*range(0, len(data), max(1, len(data) // 256))]])
     model.to(args.device)
@@ -156,6 +121,50 @@ def main(args: argparse.Namespace) -> None:
             kept |= {"step": step, "log": log, "random": torch.get_rng_state()}
             kept |= {"random_on_gpus": torch.cuda.get_rng_state_all()}
             save(args.out, model, kept | {"settings": settings})
+
+
+def make_data(buffer_set: BufferSet, args: argparse.Namespace) -> HistoryDataset:
+    """Return the items to train on."""
+    return HistoryDataset(
+        buffer_set,
+        args.conditions,
+        memory=args.memory,
+        cameras=args.cameras,
+        image_size=args.image_size,
+        chunk=args.chunk if args.task == "act" else 0,
+        split=args.split,
+        families=args.families,
+        episodes=args.episodes,
+        retrieval=args.retrieval,
+        questions=args.task == "answer",
+        redraw=args.redraw,
+        unit_episodes=args.unit_episodes,
+        seed=args.seed,
+    )
+
+
+def make_config(data: HistoryDataset, args: argparse.Namespace) -> Config:
+    """Return the configuration of a model for the items."""
+    item = data[0]
+    return Config(
+        task=args.task,
+        data=data.buffer_set.revision,
+        memory=args.memory,
+        cameras=tuple(name.removeprefix(CAMERA_PREFIX) for name in data.cameras),
+        image_size=args.image_size,
+        points=item["question.points"].shape[1] if args.task == "answer" else 1,
+        state=len(item["observation.state"]),
+        action=item["action"].shape[1] if args.task == "act" else 8,
+        chunk=args.chunk,
+        width=args.width,
+        layers=args.layers,
+        attention_dropout=not args.no_attention_dropout,
+        trunk=args.trunk,
+        pictures=not args.no_pictures,
+        positions=args.positions,
+        seed=args.seed,
+        training_steps=args.steps,
+    )
 
 
 def batches(data: HistoryDataset, args: argparse.Namespace, step: int) -> Iterator[dict[str, Any]]:

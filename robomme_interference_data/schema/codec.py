@@ -71,7 +71,7 @@ def _column(field: pa.Field, records: Sequence[Any]) -> pa.Array:
     if field.name not in _names(records[0]):  # a part of the id
         return pa.array([getattr(record.episode_id, field.name) for record in records], field.type)
     values = [getattr(record, field.name) for record in records]
-    codec = _codec(get_type_hints(type(records[0]))[field.name])
+    codec = _codec(_hints(type(records[0]))[field.name])
     if codec.write is None:
         return pa.array(values, field.type)
     if codec.item is None:
@@ -121,6 +121,9 @@ def from_dict[T](record: type[T], value: Any, path: object, *, strict: bool = Fa
         return _codec(record).read(value)  # type: ignore[no-any-return]
     except ValueError as error:
         raise FormatError.damaged(path, first_line(error)) from None
+
+
+_hints: Callable[[type], dict[str, Any]] = cache(get_type_hints)  # which compiles every annotation
 
 
 def _names(record: Any) -> list[str]:
@@ -208,7 +211,7 @@ def _map(item: _Converter) -> _Converter:
 
 
 def _record(record: Any) -> _Converter:
-    hints = get_type_hints(record)
+    hints = _hints(record)
     codecs = {name: _codec(hints[name]) for name in _names(record)}
     identified = "episode_id" in codecs
 

@@ -40,9 +40,9 @@ TASKS = range(8, 61)
 DEFAULT_TASKS = 30
 
 _CYCLE = ("recall", "update", "order", "absent", "recall", "update")
-_CYCLE_IN_PIECES = ("several", "recall", "update", "absent", "several", "order")
-_IN_PIECES = ("VideoPlaceOrder", "VideoPlaceButton", "PatternLock", "RouteStick")
-"""Families whose lessons show several parts of the answer, one after the other."""
+_CYCLE_IN_PIECES = ("several", "recall", "several", "absent", "several", "order")
+_IN_PIECES = ("PatternLock", "RouteStick")
+"""Families of which neither piece of a lesson shows the whole answer."""
 
 _LESSONS = {"recall": 1, "several": 2, "update": 2, "order-first": 2, "order-last": 2, "absent": 0}
 """Tasks that are played for a query."""

@@ -13,9 +13,9 @@ from robomme_interference_data.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from robomme_interference_data.schema.sampling import Memory
+    from robomme_interference_data.storage.resize import resize
 
     from .history_dataset import HistoryDataset
-    from .images import resize
     from .sampler import HistorySampler
 
 __all__ = ["HistoryDataset", "HistorySampler", "Memory", "resize"]
@@ -24,8 +24,8 @@ __getattr__ = lazy_exports(
     __name__,
     {
         ".history_dataset": "HistoryDataset",
-        ".images": "resize",
         ".sampler": "HistorySampler",
         "robomme_interference_data.schema.sampling": "Memory",
+        "robomme_interference_data.storage.resize": "resize",
     },
 )

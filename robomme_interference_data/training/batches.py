@@ -1,7 +1,7 @@
 """The tensors of a batch: which frames its items have in memory, now, and as actions."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,21 +9,10 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import ACTION, STATE
 from robomme_interference_data.schema.sampling import Memory
 
-from .histories import DrawnHistory
+from .item_draws import DrawnItem
+from .layout import memory_entry
 from .moments import Moments
 from .rows import PADDING, StoredRows
-
-
-class Drawn(NamedTuple):
-    """What the draws make of an index: a moment of an episode, its history and current frame."""
-
-    item: int
-    number: int  # of the episode
-    moment: int
-    condition: str
-    shift: str
-    history: DrawnHistory
-    now: int  # row of the current frame
 
 
 class Batches:
@@ -53,13 +42,13 @@ class Batches:
         self._features, self._chunk = (*cameras, STATE), chunk
         self._places, self._parts = places, parts
 
-    def arrays(self, items: Sequence[Drawn]) -> dict[str, NDArray[Any]]:
+    def arrays(self, items: Sequence[DrawnItem]) -> dict[str, NDArray[Any]]:
         """Return the entries of a batch that are arrays."""
         rows, batch = self._in_memory(items)
         now = np.array([drawn.now for drawn in items])
         for name in self._features:
             batch[name] = self._rows.take(name, now)
-            batch[f"memory.{name.removeprefix('observation.')}"] = self._rows.take(name, rows)
+            batch[memory_entry(name)] = self._rows.take(name, rows)
         moment = np.array([drawn.moment for drawn in items])
         batch["position"] = moment + [len(drawn.history.rows) for drawn in items]
         if self._chunk:
@@ -74,7 +63,7 @@ class Batches:
         batch["index"] = np.array([drawn.item for drawn in items])
         return batch
 
-    def _in_memory(self, items: Sequence[Drawn]) -> tuple[NDArray[np.int64], dict[str, Any]]:
+    def _in_memory(self, items: Sequence[DrawnItem]) -> tuple[NDArray[np.int64], dict[str, Any]]:
         """Return the rows of the frames in memory, `(B, M)`, and what is known of each place."""
         places = len(items), self._places
         rows, position = np.full(places, PADDING), np.zeros(places, np.int64)

@@ -9,11 +9,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import DEMONSTRATIONS, DISTRACTORS
+from robomme_interference_data.constants import (
+    CONTRADICTIONS,
+    DEMONSTRATIONS,
+    DISTRACTORS,
+    EXECUTIONS,
+    SHIFTED,
+)
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.query_sessions import QuerySessions, SessionSource
 from robomme_interference_data.ids import EpisodeId
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.stored_selector import StoredSelector
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.schema.manifest import SessionEntry
@@ -23,7 +30,7 @@ from .draws import number_from
 from .rows import StoredRows
 
 _HistoryKey = tuple[EpisodeId, str, Shift | None]
-"""Query episode, condition, and the shift of the first live view that a retrieval step matches."""
+"""Query episode, condition, and the shift of what a retrieval step matches, see `get`."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +93,25 @@ class Histories:
             for episode in episodes
         )
 
+    def rows_in_use(self, episodes: Collection[EpisodeId]) -> NDArray[np.int64]:
+        """Return rows, at least one of each session that histories of these episodes may have."""
+        if self._redraw is None:
+            return self.rows
+        queries, units = frozenset(episodes), self._redraw[1]
+        first = []
+        for name, dataset in self._rows.datasets.items():
+            if name in (EXECUTIONS, SHIFTED):  # of which no history has a session
+                continue
+            for record in dataset.records():
+                episode = record.episode_id
+                if name in (DEMONSTRATIONS, CONTRADICTIONS):
+                    used = episode.scene in queries
+                else:
+                    used = units is None or episode.index in units
+                if used:
+                    first.append(self._rows.first(name, record.episode_index))
+        return np.array(first, np.int64)
+
     @property
     def rows(self) -> NDArray[np.int64]:
         """The rows of all planned histories; none if they are drawn anew."""
@@ -98,21 +124,25 @@ class Histories:
         conditions: Sequence[str],
         episodes: Collection[EpisodeId],
         shifts: Collection[Shift | None],
+        *,
+        quiet: bool,
     ) -> None:
-        """Lay out the planned histories of some query episodes."""
+        """Lay out the planned histories of some query episodes, with a progress bar."""
         used = frozenset(episodes)
-        for buffer in self._set.buffers(condition=conditions):
-            if buffer.episode_id in used:
-                for shift in shifts if self._retrieval else [None]:
-                    key = buffer.episode_id, buffer.condition, shift
-                    self._known[key] = self._of(buffer, shift)
+        with WorkProgress(quiet=quiet) as progress, progress.status("Laying out histories"):
+            for buffer in self._set.buffers(condition=conditions):
+                if buffer.episode_id in used:
+                    for shift in shifts if self._retrieval else [None]:
+                        key = buffer.episode_id, buffer.condition, shift
+                        self._known[key] = self._of(buffer, shift)
 
     def get(
         self, epoch: int, episode: EpisodeId, condition: str, shift: Shift | None
     ) -> DrawnHistory:
         """Return the history of a query, planned or drawn in this epoch.
 
-        `shift` is that of the first live view, on which the choice of a retrieval step depends.
+        `shift` is that of the first live observation, on which the choice of a retrieval step
+        depends.
         """
         key = episode, condition, shift if self._retrieval else None
         if self._redraw is None:

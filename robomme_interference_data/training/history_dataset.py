@@ -10,34 +10,30 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, SHIFTED, STATE
+from robomme_interference_data.constants import ACTION, DEMONSTRATIONS, EXECUTIONS, STATE
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.dataset import camera_feature
-from robomme_interference_data.data.loading import load_buffer_set, open_cache
-from robomme_interference_data.data.state_reader import other_state_sizes, query_state_size
-from robomme_interference_data.data.views import shifted_view
+from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import HashMismatchError, InvalidOptionError, UnknownNameError
 from robomme_interference_data.ids import EpisodeId, parse_numbers, whole_number
-from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.stored_selector import StoredSelector
 from robomme_interference_data.schema.codec import to_dict
-from robomme_interference_data.schema.conditions import parse_condition
-from robomme_interference_data.schema.other_states import check_rule, check_sizes
 from robomme_interference_data.schema.sampling import Memory, spread
-from robomme_interference_data.schema.shifts import NO_SHIFT, Shift, parse_shift
+from robomme_interference_data.schema.shifts import NO_SHIFT
 from robomme_interference_data.storage.files import LocalFiles
 from robomme_interference_data.storage.text import digest_json
 
-from .batches import Batches, Drawn
+from .batches import Batches
 from .draws import Weights
 from .epoch import Epoch
 from .histories import Histories
-from .items import Items, item_of
-from .layout import LeRobotMeta, describe, renamed, transform_images
-from .moments import check_arguments, check_size, choose_moments, drawable_rows, needed_datasets
+from .image_transforms import transform_images
+from .item_draws import ItemDraws
+from .layout import LeRobotMeta, describe, renamed
+from .loaders import Items, item_of, made_or_unusable
+from .moments import choose_moments
+from .opening import check_arguments, open_rows
 from .question_tensors import QuestionTensors
-from .reopening import made_or_unusable
-from .rows import StoredRows
 
 if TYPE_CHECKING:
     from robomme_interference_data.storage.cache import DecodedCache
@@ -52,7 +48,8 @@ class HistoryDataset:
     follows from `seed`, the epoch and the index: items are the same for any number of workers and
     ranks, in any order. Frames come from the cache of decoded frames, which the first use fills.
 
-    An item has, with M memory frames, S the image size and P the most parts of an answer:
+    An item has, with M memory frames, images of S × S pixels (or the recorded height and width),
+    states of D values, actions of A, and P the most parts of an answer:
 
     - `observation.images.<camera>`: `(3, S, S) uint8` RGB, the current frame;
     - `observation.state`: `(D,) float32`: 7 joint positions in rad, opening of a finger in m;
@@ -63,7 +60,7 @@ class HistoryDataset:
     - `memory.evidence`: `(M, P) bool`, which parts of the hidden answer each frame shows; and
       `evidence_known`: `() bool`, False where that is unknown;
     - `position`: `() int64`, index of the current frame in history and execution together;
-    - `action`: `(chunk, D) float32`, the actions executed from the current frame on, and
+    - `action`: `(chunk, A) float32`, the actions executed from the current frame on, and
       `action_is_pad`: `(chunk,) bool`, True after the last one, which is repeated;
     - with `questions`, for O options with at most P points: `question` and
       `question.options` (O texts, `""` where only the points show it), `question.points`:
@@ -91,8 +88,8 @@ class HistoryDataset:
         episodes: Indices of the query episodes to use, such as `0-79`; None for all.
         retrieval: Encoder of a retrieval step before the memory, such as `thumbnail`; its index
             must be stored. `retrieval_rule` and `retrieval_camera` are those of `evaluate`.
-        shifts: Shifts of the first live view, with weights; needs the dataset `shifted` and
-            `chunk=0`, since only first views are stored.
+        shifts: Shifts of the first live observation, with weights; needs the dataset `shifted`
+            and `chunk=0`, since only first observations are stored.
         questions: Whether items have the question about the past, see `build --only questions`.
         redraw: Draw the sessions of the conditions anew in every epoch, instead of the planned
             ones. Then conditions need not be planned.
@@ -144,73 +141,66 @@ class HistoryDataset:
         image_transforms: Callable[[torch.Tensor], torch.Tensor] | None = None,
         quiet: bool = False,
     ):
-        for option, given in (("cameras", cameras), ("families", families)):
-            if isinstance(given, str):
-                raise InvalidOptionError.expected(option, given, f"a list of names: [{given!r}]")
         opened = isinstance(buffer_set, BufferSet)
         self.buffer_set: BufferSet = buffer_set if opened else load_buffer_set(buffer_set)  # type: ignore[assignment,arg-type]
         if cameras is None:
             cameras = (self.buffer_set.datasets[DEMONSTRATIONS].camera(),)
         self._arguments = dict(
             conditions=conditions, memory=memory, cameras=cameras, image_size=image_size,
-            chunk=chunk, split=split, families=tuple(families), episodes=episodes,
+            chunk=chunk, split=split, families=families, episodes=episodes,
             retrieval=retrieval, retrieval_rule=retrieval_rule, retrieval_camera=retrieval_camera,
             shifts=shifts, questions=questions, redraw=redraw, unit_episodes=unit_episodes,
             other_states=other_states, seed=seed, cache=cache, layout=layout,
             image_transforms=image_transforms,
         )  # fmt: skip
+        self._conditions = Weights.parse("conditions", conditions)
+        shift_weights = Weights.parse("shifts", shifts or {NO_SHIFT: 1})
+        check_arguments(self._arguments, shift_weights.names)
         self.layout, self._image_transforms = layout, image_transforms
         self.memory, self.seed = Memory.parse(memory), seed
         self.chunk = whole_number("chunk", chunk, "an integer from 0", 0)
         self.cameras = tuple(camera_feature(camera) for camera in cameras)
-        self._conditions = Weights.parse("conditions", conditions)
-        self._shifts = Weights.parse("shifts", shifts or {NO_SHIFT: 1})
-        self._shift_of = {name: parse_shift(name) for name in self._shifts.names}
-        shifted, actions = self._shifts.names != (NO_SHIFT,), self.chunk > 0
         units = None if unit_episodes is None else frozenset(parse_numbers(unit_episodes))
-        check_arguments(self._arguments, self._shifts.names)
         step = (
             StoredSelector(retrieval, rule=retrieval_rule, camera=retrieval_camera)
             if retrieval
             else None
         )
-        datasets = needed_datasets(
+        actions = self.chunk > 0
+        self._rows = open_rows(
             self.buffer_set,
             self._conditions.names,
+            self.cameras,
+            image_size=image_size,
+            other_states=other_states,
+            cache=cache,
             actions=actions,
-            shifts=shifted,
+            shifts=shift_weights.names != (NO_SHIFT,),
             planned=not redraw,
         )
-        self.buffer_set.check_tables(self._conditions.names, planned=not redraw)
-        for dataset in datasets.values():
-            dataset.check_records()
-        kept = open_cache(cache)
-        if kept is None:
-            raise InvalidOptionError.expected("cache", cache, "True, a folder or a DecodedCache")
-        size = check_size(self.buffer_set, self.cameras, image_size)
-        rule, others = check_rule(other_states), dict[str, int]()
-        if any(parse_condition(name).k for name in self._conditions.names):
-            others = other_state_sizes(datasets)
-        what = f"HistoryDataset of {self.buffer_set.name}"
-        check_sizes(what, query_state_size(datasets), others, rule)
-        self._rows = StoredRows(datasets, kept, size, rule)
         self._moments = choose_moments(
             self.buffer_set, self._rows, split, families, episodes, actions=actions
         )
-        draws = (seed, units) if redraw else None
-        self._histories = Histories(self.buffer_set, self._rows, step, draws)
+        self._histories = Histories(
+            self.buffer_set, self._rows, step, (seed, units) if redraw else None
+        )
         self._questions = QuestionTensors(self.buffer_set, self.episode_ids) if questions else None
-        now = self._live_rows()
-        if redraw:
-            history = drawable_rows(datasets, self._rows, self.episode_ids, units)
-        else:
-            with WorkProgress(quiet=quiet) as progress, progress.status("Laying out histories"):
-                self._histories.plan(
-                    self._conditions.names, self.episode_ids, self._shift_of.values()
-                )
-            history = self._histories.rows
+        self._draws = ItemDraws(
+            self.buffer_set,
+            self._rows,
+            self._moments,
+            self._histories,
+            self._conditions,
+            shift_weights,
+            seed,
+        )
+        if not redraw:
+            self._histories.plan(
+                self._conditions.names, self.episode_ids, self._draws.shifts.values(), quiet=quiet
+            )
         # Here, not when they are first used: a loader's forked workers share what is open now.
-        self._used = np.concatenate([now, history])
+        now = self._draws.live_rows
+        self._used = np.concatenate([now, self._histories.rows_in_use(self.episode_ids)])
         self._rows.prepare((*self.cameras, STATE), self._used, quiet=quiet)
         if actions:
             self._rows.prepare((ACTION,), now, quiet=quiet)
@@ -223,7 +213,7 @@ class HistoryDataset:
             self.memory_frames,
             self._histories.parts,
         )
-        several = len(self._conditions.names) > 1 or len(self._shifts.names) > 1
+        several = len(self._conditions.names) > 1 or len(shift_weights.names) > 1
         self._epoch = Epoch(len(self), draws=redraw or several)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -231,22 +221,38 @@ class HistoryDataset:
         # may have another working directory.
         files = self.buffer_set.files
         location = str(files.root.absolute()) if isinstance(files, LocalFiles) else files.location
-        made = (HistoryDataset._opened_again, location, self._arguments, self._epoch, self.content)
-        return made_or_unusable, made
+        arguments = (location, self._arguments, self._epoch, self._identity)
+        return made_or_unusable, (HistoryDataset._opened_again, *arguments)
 
     @classmethod
     def _opened_again(
-        cls, location: str, arguments: dict[str, Any], epoch: Epoch, content: str
+        cls, location: str, arguments: dict[str, Any], epoch: Epoch, identity: str
     ) -> "HistoryDataset":
         made = cls(location, **arguments, quiet=True)
         # Items are numbered over all episodes: in a set that grew, an index means another moment.
-        if made.content != content:
+        if made._identity != identity:
             raise HashMismatchError(
                 f"{location} was changed since the training began: a worker finds other items",
                 "Start the training again; do not change a buffer set that is in use.",
             )
         made._epoch = epoch
         return made
+
+    @property
+    def _identity(self) -> str:
+        """Digest of header, episodes, and rows of the planned histories.
+
+        If another process that opens the buffer set again finds the same, an index means the same
+        item there.
+        """
+        rows = [self._moments.first, self._histories.rows]
+        return digest_json(
+            [
+                to_dict(self.buffer_set.header),
+                [str(episode) for episode in self.episode_ids],
+                *(hashlib.sha256(numbers.tobytes()).hexdigest() for numbers in rows),
+            ]
+        )
 
     def __len__(self) -> int:
         """Return the number of items."""
@@ -270,22 +276,6 @@ class HistoryDataset:
             return self.memory.frames - 1
         longest = self._histories.longest(self._conditions.names, self.episode_ids)
         return longest + self._moments.most - 1
-
-    @cached_property
-    def content(self) -> str:
-        """Digest of what the items are of: header, episodes, and rows of the planned histories.
-
-        In another process that opened the same buffer set again, an index means the same item if
-        this is the same.
-        """
-        rows = [self._moments.first, self._histories.rows]
-        return digest_json(
-            [
-                to_dict(self.buffer_set.header),
-                [str(episode) for episode in self.episode_ids],
-                *(hashlib.sha256(one.tobytes()).hexdigest() for one in rows),
-            ]
-        )
 
     def stored_values(self, feature: str, most: int | None = None) -> NDArray[Any]:
         """Return the values of a feature in all sessions and executions in use, `(N, …)`.
@@ -390,7 +380,8 @@ class HistoryDataset:
         if indices.ndim != 1 or indices.dtype.kind not in "iu" or not len(indices):
             given = f"indices of type {indices.dtype} and shape {indices.shape}"
             raise IndexError(f"{given}; expected one integer or several")
-        items = [self._drawn(index) for index in indices.tolist()]
+        epoch = self.epoch
+        items = [self._draws.draw(epoch, index) for index in indices.tolist()]
         numbers = [drawn.number for drawn in items]
         episodes = [self.episode_ids[number] for number in numbers]
         arrays = self._batches.arrays(items)
@@ -405,30 +396,6 @@ class HistoryDataset:
             texts |= self._questions.texts(numbers)
         batch = {name: torch.from_numpy(values) for name, values in arrays.items()} | texts
         if self._image_transforms is not None:
-            keys = [(self.seed, self.epoch, drawn.item) for drawn in items]
+            keys = [(self.seed, epoch, drawn.item) for drawn in items]
             transform_images(batch, self.cameras, self._image_transforms, keys)
         return renamed(batch) if self.layout == "lerobot" else batch
-
-    def _drawn(self, index: int) -> Drawn:
-        if not -len(self) <= index < len(self):
-            raise IndexError(f"index {index} of {len(self)} items")
-        index %= len(self)
-        epoch, (number, moment) = self.epoch, self._moments.locate(index)
-        condition = self._conditions.draw("condition", self.seed, epoch, index)
-        shift = self._shifts.draw("shift", self.seed, epoch, index)
-        drawn = self._shift_of[shift]
-        history = self._histories.get(epoch, self.episode_ids[number], condition, drawn)
-        now = self._view_row(number, drawn) + moment
-        return Drawn(index, number, moment, condition, shift, history, now)
-
-    def _view_row(self, number: int, shift: Shift | None) -> int:
-        """Return the row of the first live view of an episode, given by its number."""
-        if shift is None:
-            return int(self._moments.first[number])
-        _, stored, frame = shifted_view(self.buffer_set, self.episode_ids[number], shift)
-        return self._rows.first(SHIFTED, stored) + frame
-
-    def _live_rows(self) -> NDArray[np.int64]:
-        """Return the rows of the first live views; those of later ones belong to the same spans."""
-        numbers, shifts = range(len(self.episode_ids)), self._shift_of.values()
-        return np.array([self._view_row(number, shift) for shift in shifts for number in numbers])

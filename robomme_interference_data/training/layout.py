@@ -1,8 +1,8 @@
 """Items and batches of a `HistoryDataset` as LeRobot's training loop and processors take them.
 
 LeRobot's processors keep entries below `observation.`, `action`, `task`, `index` and `…_is_pad`,
-and drop all others. So what a policy may see is below `observation.`, and what it must not see is
-below `label.`.
+and drop all others. So in the layout `lerobot`, what a policy may see is below `observation.`, and
+what it must not see is below `label.`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from robomme_interference_data.constants import ACTION, STATE
@@ -24,10 +23,8 @@ from robomme_interference_data.storage.lerobot.statistics import (
     vector_statistics,
 )
 
-from .draws import number_from
-
 LAYOUTS = ("plain", "lerobot")
-"""The names of entries: those of `HistoryDataset`, or those of this module."""
+"""The layouts: the names that `HistoryDataset` lists, and those that LeRobot keeps."""
 
 _RENAMED = {
     "memory.is_pad": MEMORY_PADDING,
@@ -46,6 +43,11 @@ _SAMPLED_IMAGES = 256
 """Most images of a camera of which the statistics of pixels are taken."""
 
 
+def memory_entry(feature: str) -> str:
+    """Return the name of a feature's values in memory, in the layout `plain`: `memory.state`."""
+    return f"memory.{feature.removeprefix('observation.')}"
+
+
 def renamed(batch: Mapping[str, Any]) -> dict[str, Any]:
     """Return an item or a batch with the names of the layout `lerobot`."""
     return {_renamed(name): values for name, values in batch.items()}
@@ -55,40 +57,6 @@ def _renamed(name: str) -> str:
     if name in _RENAMED:
         return _RENAMED[name]
     return f"observation.{name}" if name.startswith(_MOVED) else name
-
-
-def transform_images(
-    batch: dict[str, Any],
-    cameras: Sequence[str],
-    transform: Callable[[torch.Tensor], torch.Tensor],
-    keys: Sequence[tuple[int, ...]],
-) -> None:
-    """Change the images of a batch at random, all images of an item and a camera in the same way.
-
-    The current image and those in memory are changed by one call, as frames of a video, with values
-    from 0 to 1: some of LeRobot's transforms leave bytes unchanged.
-
-    Args:
-        batch: A batch with the names of the layout `plain`; is changed.
-        cameras: Features of the cameras.
-        transform: From `(M + 1, 3, S, S) float32` to the same.
-        keys: For each item, what its random numbers follow from.
-    """
-    for place, key in enumerate(keys):
-        for camera in cameras:
-            now, memory = batch[camera][place], batch[_plain(camera)][place]
-            # On CPUs only: other generators belong to the training.
-            with torch.random.fork_rng(devices=[]):
-                torch.manual_seed(number_from("transform", *key, camera))
-                changed = transform(torch.cat([memory, now[None]]).float() / 255)
-            pixels = (changed * 255).round().clamp(0, 255).to(torch.uint8)
-            memory.copy_(pixels[:-1])
-            now.copy_(pixels[-1])
-
-
-def _plain(feature: str) -> str:
-    """Return the name of a feature's values in memory, in the layout `plain`."""
-    return in_memory(feature).removeprefix("observation.")
 
 
 @dataclass(frozen=True)

@@ -1,79 +1,17 @@
-"""Which datasets and moments a `HistoryDataset` has, and the checks of its arguments."""
+"""The moments of a `HistoryDataset`: of which episodes, and in which order."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robomme_interference_data.constants import (
-    CONTRADICTIONS,
-    DEMONSTRATIONS,
-    EXECUTIONS,
-    SHIFTED,
-    SPLITS,
-)
+from robomme_interference_data.constants import DEMONSTRATIONS, EXECUTIONS, SPLITS
 from robomme_interference_data.data.buffer_set import BufferSet
-from robomme_interference_data.data.dataset import Dataset
-from robomme_interference_data.data.loading import open_dataset
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
-from robomme_interference_data.ids import EpisodeId, format_numbers, parse_numbers, whole_number
-from robomme_interference_data.schema.conditions import datasets_of, parse_condition
-from robomme_interference_data.schema.shifts import NO_SHIFT
+from robomme_interference_data.ids import EpisodeId, format_numbers, parse_numbers
 
-from .layout import LAYOUTS
 from .rows import StoredRows
-
-_NO_ACTIONS = "Items without actions (chunk=0) need no executions."
-
-
-def needed_datasets(
-    buffer_set: BufferSet, conditions: Sequence[str], *, actions: bool, shifts: bool, planned: bool
-) -> dict[str, Dataset]:
-    """Return the datasets whose frames items can have, by name."""
-    parsed = [parse_condition(name) for name in conditions]
-    datasets = {name: open_dataset(buffer_set, name) for name in datasets_of(parsed)}
-    if actions:
-        datasets[EXECUTIONS] = open_dataset(buffer_set, EXECUTIONS, _NO_ACTIONS)
-    if shifts:
-        datasets[SHIFTED] = open_dataset(buffer_set, SHIFTED)
-    if planned:
-        for condition in parsed:
-            buffer_set.planned(condition)
-    return datasets
-
-
-def check_size(buffer_set: BufferSet, cameras: Sequence[str], size: int | None) -> int | None:
-    """Check that the frames of cameras can be resized to squares of a size."""
-    demonstrations = buffer_set.datasets[DEMONSTRATIONS]
-    shapes = {one: demonstrations.shape(demonstrations.camera(one, "cameras")) for one in cameras}
-    if size is None:
-        return None
-    size = whole_number("image_size", size, "an integer from 1, or None", 1)
-    for camera, (height, width, _) in shapes.items():
-        if size > min(height, width):
-            expected = f"1 to {min(height, width)}: {camera} has {width}×{height} pixels"
-            raise InvalidOptionError.expected("image_size", size, expected)
-    return size
-
-
-def check_arguments(given: Mapping[str, Any], shifts: Sequence[str]) -> None:
-    """Check arguments of a `HistoryDataset`, and some against each other."""
-    if given["layout"] not in LAYOUTS:
-        raise InvalidOptionError.one_of("layout", given["layout"], LAYOUTS)
-    for name, default, needed in (
-        ("unit_episodes", None, "redraw"),
-        ("retrieval_rule", "max", "retrieval"),
-        ("retrieval_camera", None, "retrieval"),
-    ):
-        if given[name] != default and not given[needed]:
-            raise InvalidOptionError(
-                f"{name} has no effect without {needed}", f"Set {needed}, or leave {name} out."
-            )
-    if shifts != (NO_SHIFT,) and given["chunk"]:
-        expected = "none with actions: only first live observations are stored under shifts"
-        raise InvalidOptionError.expected("shifts", list(shifts), expected)
 
 
 @dataclass(frozen=True)
@@ -111,18 +49,22 @@ class Moments:
     def locate(self, index: int) -> tuple[int, int]:
         """Return the number of the episode of an item, and the moment."""
         number = int(np.searchsorted(self.stops, index, "right"))
-        return number, index - (int(self.stops[number - 1]) if number else 0)
+        return number, index - self._start(number)
 
     def index_of(self, episode: EpisodeId, moment: int) -> int:
         """Return the index of the item of an episode's moment."""
         if episode not in self.episodes:
             raise UnknownNameError.among("episode", str(episode), "the items", self.episodes)
         number = self.episodes.index(episode)
-        first = int(self.stops[number - 1]) if number else 0
-        if not 0 <= moment < self.stops[number] - first:
-            last = int(self.stops[number]) - first - 1
-            raise UnknownNameError(f"{episode} has the moments 0 to {last}; got {moment}")
-        return first + moment
+        start = self._start(number)
+        count = int(self.stops[number]) - start
+        if not 0 <= moment < count:
+            raise UnknownNameError(f"{episode} has the moments 0 to {count - 1}; got {moment}")
+        return start + moment
+
+    def _start(self, number: int) -> int:
+        """Return the index of the first item of an episode."""
+        return int(self.stops[number - 1]) if number else 0
 
 
 def choose_moments(
@@ -134,20 +76,21 @@ def choose_moments(
     *,
     actions: bool,
 ) -> Moments:
-    """Return the moments of executions, or the first live views where actions are not needed."""
-    there = {episode.split for episode in buffer_set.episode_ids}
-    if split not in there:
-        names = " or ".join(repr(name) for name in SPLITS if name in there)
-        raise InvalidOptionError.expected(
-            "split",
-            split,
-            f"{names}: {buffer_set.location} has no other episodes",
-            "Train on train episodes only; for others, give their split.",
-        )
-    known = buffer_set.families
-    for family in families:
-        if family not in known:
-            raise UnknownNameError.among("family", family, buffer_set.location, known)
+    """Return the moments of executions, or the first ones alone if actions are not needed.
+
+    Args:
+        buffer_set: The buffer set.
+        rows: The rows of its datasets.
+        split: Split of the episodes.
+        families: Families of the episodes; empty for all.
+        episodes: Indices of the episodes, such as `0-79`; None for all.
+        actions: Whether each moment needs an action.
+
+    Raises:
+        InvalidOptionError: There are no such episodes, or not all of them.
+        UnknownNameError: There is no such family.
+    """
+    _check_names(buffer_set, split, families)
     numbers = None if episodes is None else frozenset(parse_numbers(episodes))
     live = buffer_set.datasets[EXECUTIONS if actions else DEMONSTRATIONS]
     recorded = {
@@ -159,7 +102,7 @@ def choose_moments(
         episode
         for episode in buffer_set.episode_ids
         if episode.split == split
-        and episode.family in (families or known)
+        and episode.family in (families or buffer_set.families)
         and (numbers is None or episode.index in numbers)
         and episode in recorded
     )
@@ -178,30 +121,18 @@ def choose_moments(
     return Moments(chosen, np.array(first), counts, np.cumsum(np.maximum(counts, 1)))
 
 
-def drawable_rows(
-    datasets: Mapping[str, Dataset],
-    rows: StoredRows,
-    episodes: Collection[EpisodeId],
-    units: Collection[int] | None,
-) -> NDArray[np.int64]:
-    """Return the first rows of all sessions that histories which are drawn anew may have.
-
-    Args:
-        datasets: The datasets by name.
-        rows: Their rows.
-        episodes: The query episodes.
-        units: Indices of the episodes whose units may be drawn; None for all.
-    """
-    queries, first = frozenset(episodes), []
-    for name, dataset in datasets.items():
-        if name in (EXECUTIONS, SHIFTED):  # of which no history has a session
-            continue
-        for record in dataset.records():
-            episode = record.episode_id
-            if name in (DEMONSTRATIONS, CONTRADICTIONS):
-                used = episode.scene in queries
-            else:
-                used = units is None or episode.index in units
-            if used:
-                first.append(rows.first(name, record.episode_index))
-    return np.array(first)
+def _check_names(buffer_set: BufferSet, split: str, families: Sequence[str]) -> None:
+    """Check that there are episodes of a split and of families."""
+    splits = {episode.split for episode in buffer_set.episode_ids}
+    if split not in splits:
+        names = " or ".join(repr(name) for name in SPLITS if name in splits)
+        raise InvalidOptionError.expected(
+            "split",
+            split,
+            f"{names}: {buffer_set.location} has no other episodes",
+            "Train on train episodes only; for others, give their split.",
+        )
+    known = buffer_set.families
+    for family in families:
+        if family not in known:
+            raise UnknownNameError.among("family", family, buffer_set.location, known)

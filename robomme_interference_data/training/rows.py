@@ -22,8 +22,7 @@ from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.schema.other_states import OtherStates, fit_states
 from robomme_interference_data.storage.arrays import FeatureDigests
 from robomme_interference_data.storage.cache import DecodedCache
-
-from .images import resize
+from robomme_interference_data.storage.resize import resize
 
 PADDING = -1
 """The row of a place without a frame."""
@@ -49,11 +48,14 @@ class StoredRows:
     """The stored values of several datasets, by row; opened, and stored, when first used.
 
     Args:
-        datasets: The datasets by name.
+        datasets: The datasets by name, in the order of their rows.
         cache: Where decoded and resized frames are.
         size: Side of resized images in pixels; None for no change of size.
         other_states: What takes the place of states of units of another robot, see `other_states`
             in the schema.
+
+    Attributes:
+        datasets: The datasets by name.
     """
 
     def __init__(
@@ -63,12 +65,12 @@ class StoredRows:
         size: int | None,
         other_states: OtherStates = "refuse",
     ):
-        self._datasets, self._cache, self._size = dict(datasets), cache, size
+        self.datasets, self._cache, self._size = dict(datasets), cache, size
         self._other_states = other_states
         self._first: dict[str, list[int]] = {}
         self._spans: list[_Span] = []
         starts, self._total = [], 0
-        for name, dataset in self._datasets.items():
+        for name, dataset in self.datasets.items():
             self._first[name] = []
             for record in dataset.records():
                 self._first[name].append(self._total)
@@ -101,7 +103,7 @@ class StoredRows:
         episodes: dict[str, list[int]] = {}
         for number in used:
             episodes.setdefault(self._spans[number].dataset, []).append(self._spans[number].episode)
-        for name, dataset in self._datasets.items():
+        for name, dataset in self.datasets.items():
             files = (dataset.files_of(episode, cameras) for episode in episodes.get(name, ()))
             dataset.files.fetch(path for paths in files for path in paths)
         with (
@@ -143,7 +145,7 @@ class StoredRows:
         # Run by run of rows of the same span; PADDING belongs to none, number -1.
         bounds = [*np.diff(owner, prepend=len(self._spans)).nonzero()[0].tolist(), len(flat)]
         numbers, opened = owner[bounds[:-1]].tolist(), self._frames[feature]
-        shape = self._shape(self._datasets[self._spans[max(numbers)].dataset], feature)
+        shape = self._shape(self.datasets[self._spans[max(numbers)].dataset], feature)
         out = np.empty((len(flat), *shape), np.uint8)
         for number, (start, stop) in zip(numbers, pairwise(bounds), strict=True):
             if number < 0:
@@ -165,9 +167,9 @@ class StoredRows:
             self._read(feature, number)
         return vectors.values[rows]  # the last one, that of PADDING, is 0
 
-    def _table(self, feature: str, numbers: NDArray[np.int64]) -> "_Vectors":
+    def _table(self, feature: str, numbers: NDArray[np.int64]) -> _Vectors:
         if feature not in self._vectors:
-            dataset = self._datasets[self._spans[int(numbers.max(initial=0))].dataset]
+            dataset = self.datasets[self._spans[int(numbers.max(initial=0))].dataset]
             values = np.zeros((self._total + 1, *self._shape(dataset, feature)), np.float32)
             self._vectors[feature] = _Vectors(values, np.zeros(len(self._spans), bool))
         return self._vectors[feature]
@@ -189,7 +191,7 @@ class StoredRows:
         vectors.known[number] = True
 
     def _images(self, feature: str, span: _Span) -> NDArray[np.uint8]:
-        dataset = self._datasets[span.dataset]
+        dataset = self.datasets[span.dataset]
         if span.start == 0:
             shape = self._shape(dataset, feature)
             return cached_session(
@@ -200,7 +202,7 @@ class StoredRows:
         return np.stack([self._converted(frame) for frame in frames])
 
     def _stored(self, feature: str, span: _Span) -> NDArray[np.float32]:
-        dataset, digests = self._datasets[span.dataset], FeatureDigests()
+        dataset, digests = self.datasets[span.dataset], FeatureDigests()
         record = dataset.record(span.episode)
         values = dataset.read_vectors(span.episode, feature, 0, record.length)
         digests.update(feature, values[slice(*record.session)])
@@ -216,7 +218,7 @@ class StoredRows:
 
     def _shape(self, dataset: Dataset, feature: str) -> tuple[int, ...]:
         if feature == STATE:  # the query's number of values, also of units of another robot
-            return self._datasets.get(DEMONSTRATIONS, dataset).features[STATE]
+            return self.datasets.get(DEMONSTRATIONS, dataset).features[STATE]
         if not _is_camera(feature):
             return dataset.features[feature]
         height, width, _ = dataset.shape(feature)
@@ -228,7 +230,7 @@ class StoredRows:
         for number in used:
             span = self._spans[number]
             for camera in cameras:
-                frame = self._shape(self._datasets[span.dataset], camera)
+                frame = self._shape(self.datasets[span.dataset], camera)
                 size += (span.stop - span.start) * int(np.prod(frame))
         if size > self._cache.max_bytes:
             bound = self._cache.max_bytes

@@ -10,11 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.messages import raises
 
-from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.constants import ABILITIES, FAMILIES
 from robomme_interference_data.errors import InvalidIdError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.days import (
-    ABILITIES,
     TASKS,
     DayPlan,
     ability_of,

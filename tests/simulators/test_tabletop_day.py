@@ -27,7 +27,12 @@ from robomme_interference_data.simulators.tabletop.simulator import TabletopSimu
 
 UNMASK, LOCK = "VideoUnmask/test/0", "PatternLock/test/0"
 ABSENT, PRESENT, ORDER = UNMASK, "VideoUnmask/test/1", "VideoUnmask/test/5"
-PIECES = ("VideoPlaceOrder", "VideoPlaceButton", "PatternLock", "RouteStick")
+PIECES = (
+    "VideoPlaceOrder/test/0",
+    "VideoPlaceButton/test/0",
+    "PatternLock/test/2",
+    "RouteStick/test/0",
+)
 
 TASKS = (
     (UNMASK, "lesson", "none", 10),
@@ -109,16 +114,17 @@ def test_a_task_equals_its_demonstration_bit_for_bit(
     simulator: TabletopDaySimulator, played: Played, number: int, episode: str
 ) -> None:
     """Of a first piece, all frames until the arm goes home."""
-    lesson, _, _ = simulator.reset(episode)
     span = played.spans[number]
+    whole = span.part == "lesson"
+    lesson, _, _ = simulator.reset(episode, demonstration=whole)
     # Of PatternLock's pieces, the first ends between two buttons: 10 + 57 + 8 frames, then 26 each.
-    frames = len(lesson) if span.part == "lesson" else 10 + 65 + 26
+    frames = len(lesson) if whole else 10 + 65 + 26
     at = slice(span.start, span.start + frames)
     assert np.array_equal(played.states[at], lesson.states[:frames])
     assert np.array_equal(played.actions[at], lesson.actions[:frames])
-    for name in ("front", "wrist"):
-        assert np.array_equal(played.images[name][at], lesson.images[name][:frames])
-    if span.part == "lesson":
+    if whole:
+        for name in ("front", "wrist"):
+            assert np.array_equal(played.images[name][at], lesson.images[name])
         assert lesson.evidence is not None
         assert [(seen.part, seen.text, seen.start, seen.stop) for seen in span.evidence] == [
             (seen.part, seen.text, span.start + seen.start, span.start + seen.stop)
@@ -128,7 +134,7 @@ def test_a_task_equals_its_demonstration_bit_for_bit(
 
 def test_nothing_jumps(simulator: TabletopDaySimulator, played: Played) -> None:
     """Where a transition is slow, the two frames at each of its ends are the same picture."""
-    slow = 400
+    slow = 150
     plan = planned(*((episode, part, "none", slow) for episode, part, _, _ in TASKS))
     tasks = [span.stop - span.start for span in played.spans[1::2]]
     borders = np.cumsum([length for task in tasks for length in (slow, task)])[:-1]
@@ -173,19 +179,16 @@ def test_both_pieces_together_show_every_part(played: Played) -> None:
 def test_the_same_plan_gives_the_same_bytes_after_anything_else(
     simulator: TabletopDaySimulator, played: Played
 ) -> None:
-    plan = planned(*TASKS)
-    given_up = simulator.play_day(plan).frames()
-    for number, (frame, _) in zip(range(30), given_up, strict=False):
-        for name, frames in played.images.items():
-            assert np.array_equal(frame.images[name], frames[number])
-    given_up.close()
-    simulator.env.drawing = False
-    simulator.reset(PRESENT)
-    again = play(simulator, plan)
-    simulator.env.drawing = True
-    assert again.spans == played.spans
-    assert np.array_equal(again.states, played.states)
-    assert np.array_equal(again.actions, played.actions)
+    """Also after a day that was given up, and an episode."""
+    for _ in range(2):
+        frames = simulator.play_day(planned(*TASKS)).frames()
+        for number, (frame, action) in zip(range(30), frames, strict=False):
+            assert np.array_equal(frame.state, played.states[number])
+            assert np.array_equal(action, played.actions[number])
+            for name, images in played.images.items():
+                assert np.array_equal(frame.images[name], images[number])
+        frames.close()
+        simulator.reset(PRESENT, demonstration=False)
 
 
 @pytest.mark.slow
@@ -193,7 +196,7 @@ def test_the_same_plan_gives_the_same_bytes_after_anything_else(
 def test_tasks_of_all_families_equal_their_demonstrations(
     blind: TabletopDaySimulator, family: str
 ) -> None:
-    episode = f"{family}/test/2"
+    episode = f"{family}/test/0"
     day = play(blind, planned((episode, "lesson", "none", 10)))
     lesson, _, _ = blind.reset(episode)
     assert np.array_equal(day.states[10:], lesson.states)
@@ -201,12 +204,8 @@ def test_tasks_of_all_families_equal_their_demonstrations(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("family", PIECES)
-@pytest.mark.parametrize("index", [0, 1, 2])
-def test_pieces_of_all_families_show_every_part(
-    blind: TabletopDaySimulator, family: str, index: int
-) -> None:
-    episode = f"{family}/test/{index}"
+@pytest.mark.parametrize("episode", PIECES)
+def test_pieces_of_all_families_show_every_part(blind: TabletopDaySimulator, episode: str) -> None:
     pieces = [(episode, "second", "none", 10), (episode, "first", "none", 10)]
     day = play(blind, planned(*pieces))
     lesson, _, _ = blind.reset(episode)
@@ -214,7 +213,9 @@ def test_pieces_of_all_families_show_every_part(
         {seen.part: seen.text for seen in day.spans[number].evidence} for number in (1, 3)
     )
     assert first | second == {seen.part: seen.text for seen in lesson.evidence or ()}
-    assert set(first) - set(second) and set(second) - set(first)
+    assert set(second) - set(first)
+    # In VideoPlaceButton, the cube still rests where it was before the button was pressed.
+    assert set(first) - set(second) or episode.startswith("VideoPlaceButton")
     assert max(np.abs(after - before).max() for before, after in pairwise(day.states)) < 0.2
 
 
@@ -249,15 +250,17 @@ def roll_out(
 
 
 def test_where_nothing_was_shown_holding_still_is_right(short: TabletopDaySimulator) -> None:
-    assert roll_out(short, ABSENT, "oracle") is Status.SUCCESS
     assert roll_out(short, ABSENT, "recall") is Status.SUCCESS
     assert roll_out(short, PRESENT, "recall") is Status.TIMEOUT
-    first = short.env.hold()
-    assert np.array_equal(short.env.arm.home_qpos[:7].astype(np.float32), first[:7])
     short.reset(ABSENT, demonstration=False)
-    subgoal = short.subgoal()
-    assert not subgoal.points
-    assert np.array_equal(short.follow_subgoal(subgoal), first)
+    home = np.append(short.env.arm.home_qpos[:7], 1.0).astype(np.float32)
+    assert np.array_equal(short.follow_subgoal(short.subgoal()), home)
+    statuses = []
+    for _ in range(6):
+        action = short.act("oracle")
+        assert np.array_equal(action, home)
+        statuses.append(short.step(action, observe=False)[1])
+    assert statuses == [*[Status.ONGOING] * 5, Status.SUCCESS]
 
 
 def test_where_nothing_was_shown_any_answer_is_wrong(blind: TabletopDaySimulator) -> None:

@@ -45,7 +45,7 @@ class TinyMemoryConfig(PreTrainedConfig):
 
 
 class TinyMemoryPolicy(PreTrainedPolicy):
-    """A linear function of states, mean colors, and their means over the memory."""
+    """A linear function, with dropout, of states, mean colors, and their means over the memory."""
 
     config_class = TinyMemoryConfig
     name = "tiny_memory"
@@ -53,6 +53,7 @@ class TinyMemoryPolicy(PreTrainedPolicy):
     def __init__(self, config: TinyMemoryConfig, **_: Any):
         super().__init__(config)
         state, action = config.robot_state_feature.shape[0], config.action_feature.shape[0]
+        self.dropout = torch.nn.Dropout(0.1)
         self.head = torch.nn.Linear(2 * (state + 3), config.chunk_size * action)
 
     def get_optim_params(self) -> Any:
@@ -70,7 +71,9 @@ class TinyMemoryPolicy(PreTrainedPolicy):
             (batch["observation.memory.state"] * share).sum(1),
             (batch["observation.memory.images.front"].mean((3, 4)) * share).sum(1),
         ]
-        return self.head(torch.cat(seen, -1)).unflatten(-1, (self.config.chunk_size, -1))
+        return self.head(self.dropout(torch.cat(seen, -1))).unflatten(
+            -1, (self.config.chunk_size, -1)
+        )
 
     def select_action(self, batch: dict[str, Any], **_: Any) -> torch.Tensor:
         return self.predict_action_chunk(batch)[:, 0]

@@ -5,24 +5,30 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.buffer_sets import plan_again
 from support.package import imported_modules
+from support.retrieval import make_index
 from support.runs import untimed
 
+from robomme_interference_data.build_dataset.dataset.build import build_dataset
+from robomme_interference_data.build_dataset.dataset.plan import DatasetPlan
+from robomme_interference_data.build_dataset.plan.episodes import choose_episodes
+from robomme_interference_data.build_dataset.sources import open_source
 from robomme_interference_data.errors import LeakError, NoRendererError
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
 from robomme_interference_data.evaluate.probe.result import Probe
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Serial
 
 pytest.importorskip("mani_skill", reason="needs the extra sim")
 pytestmark = pytest.mark.slow
 
-COMMAND = Path(sys.executable).parent / "robomme-interference"
 EXAMPLE = Path(__file__).parents[2] / "examples" / "memory_policy"
 
 
 @pytest.fixture(scope="module")
 def buffer_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two query episodes, a distractor unit."""
+    """Two query episodes, a distractor unit; built in this process, which imports all once."""
     from robomme_interference_data.simulators.registry import make_simulator
 
     try:
@@ -30,17 +36,18 @@ def buffer_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
     except NoRendererError as error:
         pytest.skip(str(error))
     out = tmp_path_factory.mktemp("tabletop")
-    played = "--source tabletop --episodes 0 --cameras front --workers 2"
-    for words in (
-        f"build {out} --only demonstrations {played} --split test --families MoveCube,RouteStick",
-        f"build {out} --only executions {played} --split test --families RouteStick",
-        f"build {out} --only distractors {played} --families PatternLock",
-        f"build {out} --only manifests --conditions no-history,k0,k1",
-        f"index {out}",
-    ):
-        command = [COMMAND, *words.split()]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=400, check=False)
-        assert done.returncode == 0, done.stderr
+
+    def build(kind: str, split: str, *families: str, every: int = 1) -> None:
+        source = open_source("tabletop", every=every)
+        episodes = choose_episodes((source,), split=split, families=families, numbers=(0,))
+        plan = DatasetPlan(kind, (source,), episodes, cameras=("front",))
+        build_dataset(plan, out / kind, Serial(), WorkProgress(quiet=True))
+
+    build("demonstrations", "test", "MoveCube", "RouteStick")
+    build("executions", "test", "RouteStick")
+    build("distractors", "train", "PatternLock", every=8)
+    plan_again(out, ("no-history", "k0", "k1"))
+    make_index(out)
     return out
 
 
@@ -69,6 +76,7 @@ _RETRIEVE = """
 from pathlib import Path
 
 from robomme_interference_data.evaluate import RunConfig, run_evaluation
+from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Serial
 
 config = RunConfig(
@@ -135,9 +143,7 @@ def test_the_example_policy_learns_to_act(
     """It is trained on one execution, and carries it out from the lesson."""
     monkeypatch.syspath_prepend(str(EXAMPLE))
     run = tmp_path / "run"
-    options = (
-        "--split test --task act --conditions k0 --noise 0.005 --learning-rate 2e-3 --device cpu"
-    )
+    options = "--task act --conditions k0 --noise 0.005 --learning-rate 2e-3 --device cpu"
     small = "--split test --steps 400 --batch 16 --image-size 16"
     program = [sys.executable, EXAMPLE / "train.py", buffer_set, "--out", run]
     program += [*options.split(), *small.split()]

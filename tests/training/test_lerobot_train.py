@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from support.buffer_sets import copy_buffer_set, plan_again
+from support.buffer_sets import build, copy_buffer_set, plan_again
 from support.lazy import lazy
+from support.machine import full_disk
 from support.messages import raises
 
 from robomme_interference_data import load_buffer_set
+from robomme_interference_data.build_dataset.sources.sample import SampleSource
 from robomme_interference_data.errors import (
     HashMismatchError,
     InvalidOptionError,
@@ -124,6 +126,8 @@ def test_the_memory_is_normalized_like_the_current_frame(
 
 def test_what_does_not_fit(train: Train, tmp_path: Path) -> None:
     for options in (
+        (*TINY, "--stepz=2"),
+        (*TINY, "--steps=two"),
         ("--policy.type=act", "--policy.device=cpu"),
         (*TINY, "--dataset.streaming=true"),
         (*TINY, "--dataset.eval_split=0.5"),
@@ -153,6 +157,30 @@ def test_a_changed_buffer_set_does_not_resume(
         train(*resumed(run, "--steps=2"), buffers=buffers)
 
 
+def test_held_out_items_are_the_same_each_time(train: Train, tmp_path: Path) -> None:
+    """The last episode of three, under the same conditions, in the epochs of the others."""
+    buffers, source = copy_buffer_set(tmp_path / "buffers"), SampleSource(size=32)
+    for kind in ("demonstrations", "executions"):
+        build(buffers, kind, source, families=["MoveCube"], split="train")
+    plan_again(buffers, ("k0", "k1"))
+    options = ("--steps=3", "--batch_size=500", "--eval_steps=1", "--dataset.eval_split=0.3")
+    run = train(*TINY, *options, conditions={"k0": 1, "k1": 1}, split="train", buffers=buffers)
+    seen = lines(run)
+    trained, evaluated = seen[::2], seen[1::2]
+    assert len(evaluated[0]["index"]) == 260 - 48
+    assert evaluated == [evaluated[0]] * 3 and trained[0] != trained[1]
+
+
+def test_a_full_disk(train: Train) -> None:
+    """The checkpoint that could not be written is an error; the one before resumes."""
+    run = train(*TINY, "--policy.chunk_size=5000", "--steps=1", "--batch_size=2")
+    with full_disk(1_000_000), pytest.raises(OSError, match="cannot be written") as error:
+        train(*resumed(run, "--steps=2"))
+    assert error.value.errno  # an error of the system, for which the command has a hint
+    train(*resumed(run, "--steps=2"))
+    assert (run / "checkpoints" / "last").resolve().name == "000002"
+
+
 def test_another_version_of_lerobot(monkeypatch: pytest.MonkeyPatch) -> None:
     check_lerobot()
     monkeypatch.setattr(metadata, "version", lambda name: "0.7.0")
@@ -163,7 +191,7 @@ def test_another_version_of_lerobot(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 def test_a_resumed_training_is_the_same(train: Train) -> None:
-    """Across the end of an epoch, with another number of workers, and with image transforms."""
+    """Across the end of an epoch, with other workers, image transforms, and dropout."""
     options = (*TINY, "--batch_size=100", "--dataset.image_transforms.enable=true")
     whole = train(*options, "--steps=9")
     expected = lines(whole)

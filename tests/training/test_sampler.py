@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from accelerate import Accelerator
+from accelerate.data_loader import prepare_data_loader
 from support.messages import raises
 from torch.utils.data import DataLoader
 
@@ -90,6 +91,20 @@ def test_accelerate_begins_each_epoch(data: HistoryDataset) -> None:
     loader = Accelerator(cpu=True).prepare(DataLoader(data, 50, sampler=sampler))
     epochs = [drawn(loader) for _ in range(2)]
     assert [dict(epoch) for epoch in epochs] == [expected(data, 4), expected(data, 5)]
+
+
+def test_accelerate_divides_an_epoch_among_ranks(data: HistoryDataset) -> None:
+    """No item is taken twice, and its condition is the one that it has without ranks."""
+    epochs: list[list[list[tuple[int, str]]]] = []
+    for rank in range(2):
+        loader = DataLoader(data, len(data) // 4, sampler=HistorySampler(data))
+        share = prepare_data_loader(
+            loader, num_processes=2, process_index=rank, put_on_device=False
+        )
+        epochs.append([drawn(share) for _ in range(2)])
+    for number, (first, second) in enumerate(zip(*epochs, strict=True)):
+        assert len(first) == len(second) == len(data) // 2
+        assert dict(first) | dict(second) == expected(data, number)
 
 
 def test_items_taken_again_warn_once(make: Make, data: HistoryDataset) -> None:

@@ -1,6 +1,7 @@
 """Draws of `HistoryDataset`, the same in all processes, and what other processes find."""
 
 import copy
+import os
 import pickle
 from collections import Counter
 from collections.abc import Callable
@@ -101,14 +102,36 @@ def test_sessions_drawn_anew_keep_the_rules(make: Make, buffers: Path) -> None:
 
 
 @pytest.mark.slow
-def test_spawned_workers_open_the_same_items(make: Make) -> None:
-    data = make({"k0": 1, "k3": 1}, chunk=0)
+@pytest.mark.parametrize("options", [{}, {"redraw": True, "retrieval": "thumbnail"}])
+def test_spawned_workers_open_the_same_items(options: dict[str, Any], make: Make) -> None:
+    data = make({"k1": 1, "k3": 1}, chunk=0, **options)
+    data.set_epoch(1)
     loader = torch.utils.data.DataLoader(
         data, num_workers=1, batch_size=None, multiprocessing_context="spawn"
     )
     for index, item in enumerate(loader):
         assert item["condition"] == data[index]["condition"]
-        assert torch.equal(item["memory.images.front"], data[index]["memory.images.front"])
+        for name in ("position", "memory.position", "memory.images.front"):
+            assert torch.equal(item[name], data[index][name])
+
+
+def test_damaged_frames_of_the_cache_are_decoded_again(
+    make: Make, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """When a process first opens them, whatever their size and time of writing."""
+    expected = make(["k1"], cache=tmp_path)[0]
+    names = [path.name for path in tmp_path.iterdir()]
+    for path in map(tmp_path.joinpath, names):
+        stat = path.stat()
+        damaged = bytes(stat.st_size - 32) + path.read_bytes()[-32:]
+        path.unlink()  # what the first dataset has open stays
+        path.write_bytes(damaged)
+        os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    monkeypatch.setattr("robomme_interference_data.storage.cache._checked", {})  # a new process
+    found = make(["k1"], cache=tmp_path)[0]
+    assert all(f"{name} is damaged" in caplog.text for name in names)
+    for name in ("observation.images.front", "memory.images.front"):
+        assert found[name].any() and torch.equal(found[name], expected[name])
 
 
 def test_a_buffer_set_that_changed_is_an_error_of_its_items(

@@ -11,6 +11,7 @@ from robomme_interference_data.schema.memory_features import (
     MEMORY_PADDING,
     MEMORY_POSITION,
     POSITION,
+    declares_memory,
     in_memory,
 )
 from robomme_interference_data.schema.sampling import Memory
@@ -26,10 +27,10 @@ _INDICES = (POSITION, MEMORY_POSITION, MEMORY_PADDING)
 def declared_memory(path: str, config: Any) -> Memory | None:
     """Return the memory that a policy's configuration declares, or None.
 
-    It declares one by the fields `memory`, a rule such as `framesamp:32`, and `image_size`, the
-    side of current images and of those in memory, in pixels; None for no change of size.
+    Raises:
+        PolicyError: There is no such memory rule.
     """
-    if not (hasattr(config, "memory") and hasattr(config, "image_size")):
+    if not declares_memory(config):
         return None
     try:
         return Memory.parse(config.memory)

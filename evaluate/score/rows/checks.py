@@ -84,7 +84,10 @@ class Checks:
         None is an unknown value, which fits all others, unless it counts.
         """
         rows = self.sound.values()
-        keys, values = [*map(attrgetter(*group), rows)], [*map(attrgetter(name), rows)]
+        values = [*map(attrgetter(name), rows)]
+        if len({*values}) < 2:  # as most columns of a file
+            return
+        keys = [*map(attrgetter(*group), rows)]
         counts = defaultdict[Any, Counter[Any]](Counter)
         for key, value in zip(keys, values, strict=True):
             if none_counts or value is not None:

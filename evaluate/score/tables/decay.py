@@ -1,7 +1,9 @@
 """The success of each system over k: its slope, and whether its fall is a line."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -21,6 +23,7 @@ from robomme_interference_data.stats.bootstrap import (
     DRAWS,
     MIN_EPISODES,
     Floats,
+    Interval,
     bootstrap,
     known_interval,
     residual_weights,
@@ -118,12 +121,12 @@ def _fitted(outcomes: Outcomes, draws: int) -> list[dict[str, Any]]:
     falls = list(fall_of.values())
     tests = sign_flips(np.stack([fall.slopes for fall in falls], axis=1).round(12), key, draws)
     p_fits = fits([fall.success for fall in falls], list(ks_of.values()), key, draws)
+    intervals = _intervals(outcomes, fall_of, draws)
     records = []
     for (system, conditions), fall, test, p_fit in zip(
         ks_of.items(), falls, tests, p_fits, strict=True
     ):
-        here = outcomes.has_episode[outcomes.systems.index(system)]
-        [interval] = bootstrap(fall.slopes[here, None], key, draws)
+        interval = intervals[system]
         contributing = fall.slopes[~np.isnan(fall.slopes)]
         spread = run_spread(fall.by_run)
         slope = spread.widen(known_interval(interval, contributing), LEVEL, _UNLIMITED)
@@ -151,6 +154,22 @@ def _fitted(outcomes: Outcomes, draws: int) -> list[dict[str, Any]]:
     return records
 
 
+def _intervals(
+    outcomes: Outcomes, fall_of: Mapping[str, "Falls"], draws: int
+) -> dict[str, Interval]:
+    """Return the bootstrap interval of each system's slope."""
+    # Systems with the same episodes have the same draws, which are made once.
+    alike = defaultdict[bytes, list[str]](list)
+    for system in fall_of:
+        alike[outcomes.has_episode[outcomes.systems.index(system)].tobytes()].append(system)
+    intervals: dict[str, Interval] = {}
+    for systems in alike.values():
+        here = outcomes.has_episode[outcomes.systems.index(systems[0])]
+        slopes = np.stack([fall_of[system].slopes[here] for system in systems], axis=1)
+        intervals |= zip(systems, bootstrap(slopes, outcomes.simulator, draws), strict=True)
+    return intervals
+
+
 def shared_ks(outcomes: Outcomes, *systems: str) -> list[str]:
     """Return the `k<n>` under which all systems have rows; none if there is only one."""
     shared = [c for c in outcomes.conditions if all(c in outcomes.ran(name) for name in systems)]
@@ -172,15 +191,30 @@ class Falls(NamedTuple):
     residuals: Floats  # from the line, by training run, along K − 2 directions, (E, R, K − 2)
 
 
+class _Line(NamedTuple):
+    """What takes rates under K conditions to the line over log2(k + 1) that fits them."""
+
+    slope: Floats  # to its slope, (K,)
+    residuals: Floats  # to the distances from it, (K, K)
+    directions: Floats  # to their K − 2 orthogonal directions, (K, K − 2)
+
+
+@cache
+def _line(conditions: tuple[str, ...]) -> _Line:
+    ks = [parse_condition(name).k for name in conditions]
+    residuals = residual_weights(ks)
+    directions = np.linalg.svd(residuals)[0][:, : len(ks) - 2]
+    return _Line(slope_weights(ks), residuals, directions)
+
+
 def falls_of(status: Statuses, training: NDArray[np.int64], conditions: Sequence[str]) -> Falls:
     """Return the falls of outcomes, `(K, E, M) int8`."""
-    ks = [parse_condition(name).k for name in conditions]
-    weights = slope_weights(ks)
+    line = _line(tuple(conditions))
     by_condition = success(status).T
     by_run = success_by_run(status, training).transpose(1, 2, 0)
-    # The directions in which rates can depart from a line: orthogonal ones.
-    directions = np.linalg.svd(residual_weights(ks))[0][:, : len(ks) - 2]
-    return Falls(by_condition, by_condition @ weights, by_run @ weights, by_run @ directions)
+    return Falls(
+        by_condition, by_condition @ line.slope, by_run @ line.slope, by_run @ line.directions
+    )
 
 
 def spreads_along(residuals: Floats) -> list[RunSpread]:
@@ -213,8 +247,7 @@ def fits(
 ) -> list[float]:
     """Return p of no departure of values, `(E, K)`, from a line over k; NaN for two conditions."""
     residuals = [
-        by_k @ residual_weights([parse_condition(name).k for name in names])
-        for by_k, names in zip(values, conditions, strict=True)
+        by_k @ _line(tuple(names)).residuals for by_k, names in zip(values, conditions, strict=True)
     ]
     ps = vector_sign_flips(residuals, key, draws)
     # Two points are always on a line.

@@ -1,8 +1,9 @@
 """Which of two systems falls faster over k."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import cache, partial
 from itertools import combinations
 from typing import NamedTuple
 
@@ -138,7 +139,19 @@ class _Apart(NamedTuple):
         ]
 
 
-def _apart(outcomes: Outcomes, system: str, other: str) -> _Apart | None:
+_FallsOf = Callable[[str, tuple[str, ...], tuple[bool, ...]], Falls]
+"""From a system, conditions, and which repeats are used, to the system's falls."""
+
+
+def _falls(
+    outcomes: Outcomes, system: str, conditions: tuple[str, ...], repeats: tuple[bool, ...]
+) -> Falls:
+    used = np.array(repeats)
+    status = statuses_of(outcomes, system, conditions)[..., used]
+    return falls_of(status, outcomes.training[used], conditions)
+
+
+def _apart(outcomes: Outcomes, falls: _FallsOf, system: str, other: str) -> _Apart | None:
     """Return the falls of two systems; None if they are not compared."""
     conditions = shared_ks(outcomes, system, other)
     if not conditions or not outcomes.pairable(system, other):
@@ -152,16 +165,18 @@ def _apart(outcomes: Outcomes, system: str, other: str) -> _Apart | None:
         both = [shared_runs([*side], training) for side in (first, second)]
     if not all(runs.any() for runs in both):
         return None
-    falls = [
-        falls_of(side[..., runs], training[runs], conditions)
-        for side, runs in zip((first, second), both, strict=True)
-    ]
-    return _Apart(system, other, conditions, falls[0], falls[1], related)
+    of_other, of_system = (
+        falls(name, tuple(conditions), tuple(runs.tolist()))
+        for name, runs in zip((other, system), both, strict=True)
+    )
+    return _Apart(system, other, conditions, of_other, of_system, related)
 
 
 def _interactions(outcomes: Outcomes, draws: int) -> list[Contrast]:
     systems = [name for name in outcomes.systems if not outcomes.is_reference(name)]
-    every = [_apart(outcomes, *both) for both in combinations(systems, 2)]
+    # A system is in many pairs.
+    falls = cache(partial(_falls, outcomes))
+    every = [_apart(outcomes, falls, *both) for both in combinations(systems, 2)]
     compared = [apart for apart in every if apart is not None]
     if not compared:
         return []

@@ -10,7 +10,7 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, islice
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,13 +25,13 @@ from robomme_interference_data.simulators.episode import Observation
 from .bodies import Body, Color, SceneBuilder
 from .episodes import difficulty_of, seed_of
 from .families import draw_episode
-from .family import Family
+from .family import Family, Layout
 from .motion import HELD, Arm, Script, eased
 
 if TYPE_CHECKING:
-    from .env import Layout, TabletopEnv
+    from .env import TabletopEnv
 
-Frame = tuple[Observation, NDArray[np.float32]]
+TimeStep = tuple[Observation, NDArray[np.float32]]
 """An observation, and the action `(8,) float32` that is executed after it."""
 
 TABLE: Color = (0.58, 0.56, 0.50)
@@ -51,10 +51,11 @@ _Shown = tuple[Observation, NDArray[np.float32], tuple[int, ...]]
 class EmptyTable:
     """A table without anything on it."""
 
-    table = TABLE
-    floor = Family.floor
-    stick = 0.0
-    pace = Family.pace
+    table: ClassVar[Color] = TABLE
+    floor: ClassVar[Color] = Family.floor
+    stick: ClassVar[float] = 0.0
+    pace: ClassVar[float] = Family.pace
+    showing: tuple[int, ...] = ()
 
     def build(self, builder: SceneBuilder) -> None:
         """Build nothing."""
@@ -73,7 +74,7 @@ class Standing:
         qpos: Positions of all joints, `(9,) float64`.
     """
 
-    layout: "Layout"
+    layout: Layout
     poses: Sequence[Any]
     qpos: NDArray[np.float64]
 
@@ -129,7 +130,7 @@ class Transition(EmptyTable):
 
         for (bodies, poses), y in zip(self._groups, (part, part - 1), strict=True):
             for body, pose in zip(bodies, poses, strict=True):
-                body.pose = sapien.Pose(pose.p + np.float32([0, y * _AWAY, 0]), pose.q)
+                body.pose = sapien.Pose(pose.p + np.array([0, y * _AWAY, 0], np.float32), pose.q)
         self._robot.set_qpos(self.qpos(part).astype(np.float32))
         if self._stick is not None:
             old, new = (stick or _INSIDE for stick in self._sticks)
@@ -162,8 +163,8 @@ class PlayedDay:
         self._look = int.from_bytes(hashlib.sha256(str(plan.day).encode()).digest()[:4])
         self._cuts: dict[EpisodeId, int] = {}
 
-    def frames(self) -> Iterator[Frame]:
-        """Yield each frame of the day once, with the action that is executed after it.
+    def frames(self) -> Iterator[TimeStep]:
+        """Yield each time step of the day once, in order.
 
         The same plan gives the same frames, bit for bit.
         """
@@ -176,7 +177,7 @@ class PlayedDay:
         finally:
             gc.unfreeze()
 
-    def _frames(self) -> Iterator[Frame]:
+    def _frames(self) -> Iterator[TimeStep]:
         self._env.load(EmptyTable())
         standing = self._standing()
         for task in self._plan.tasks:
@@ -198,7 +199,7 @@ class PlayedDay:
         shift: str,
         frames: Iterator[_Shown],
         texts: Sequence[str] = (),
-    ) -> Iterator[Frame]:
+    ) -> Iterator[TimeStep]:
         """Yield the frames of a span, then record it; `texts` are the parts of the answer."""
         start = self.spans[-1].stop if self.spans else 0
         shown = []
@@ -225,10 +226,8 @@ class PlayedDay:
     def _play(self, script: Script, task: PlannedTask) -> Iterator[_Shown]:
         """Yield the frames of a task."""
         self._show(task)
-        layout = self._env.layout
         for action in self._env.execute(script):
-            showing = layout.showing if isinstance(layout, Family) else ()
-            yield self._env.observe(self._cameras), action, showing
+            yield self._env.observe(self._cameras), action, self._env.layout.showing
 
     def _show(self, task: PlannedTask) -> None:
         self._env.show(parse_shift(task.shift), self._look)
@@ -259,8 +258,8 @@ class PlayedDay:
         """Load the scene of an episode; return its parts, and the script of its demonstration."""
         seed = seed_of(episode)
         scene = draw_episode(episode.family, seed, difficulty_of(seed))
-        own = episode.answer is None
-        answer = scene.own_answer(seed) if own else scene.answers[episode.answer]
+        number = episode.answer
+        answer = scene.own_answer(seed) if number is None else scene.answers[number]
         self._env.load(scene, seed)
         return scene.parts(answer), scene.demonstrate(self._env.arm, answer)
 

@@ -1,7 +1,7 @@
 """The ManiSkill environment behind all nine families."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import sapien
@@ -25,6 +25,7 @@ from .camera import FRONT_EYE, FRONT_TARGET, FRONT_VIEW, SIZE, to_pixels
 from .drawing import PANDA, SHADER, draw_low_polygon
 from .episodes import difficulty_of, turn_of
 from .families import draw_episode
+from .family import Layout
 from .motion import BASE, Arm, Point, Script
 from .renderer import make_renderer
 
@@ -43,21 +44,6 @@ _POSSIBLE: dict[str, tuple[Any, ...]] = {
 }
 # Without rendering.
 _POSSIBLE_BLIND = _POSSIBLE | {"obs_mode": ("none", "state", "state_dict"), "render_mode": (None,)}
-
-
-class Layout(Protocol):
-    """What stands on the table: an episode of a family, or a scene between two; see `Family`."""
-
-    table: Color
-    floor: Color
-    stick: float
-    pace: float
-
-    def build(self, builder: SceneBuilder) -> None:
-        """Build the bodies."""
-
-    def react(self, arm: Arm) -> None:
-        """Update the scene after a step."""
 
 
 class TabletopEnv(BaseEnv):  # type: ignore[misc]

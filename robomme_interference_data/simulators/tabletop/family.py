@@ -8,7 +8,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.random import RandomState
@@ -45,6 +45,22 @@ class Step:
     text: str
     at: tuple[Point, ...]
     do: Callable[[Arm], Script]
+
+
+class Layout(Protocol):
+    """What stands on the table: an episode of a family, or a scene between two; see `Family`."""
+
+    table: ClassVar[Color]
+    floor: ClassVar[Color]
+    stick: ClassVar[float]
+    pace: ClassVar[float]
+    showing: tuple[int, ...]
+
+    def build(self, builder: SceneBuilder) -> None:
+        """Build the bodies."""
+
+    def react(self, arm: Arm) -> None:
+        """Update the scene after a step."""
 
 
 class Family(Scene):

@@ -7,13 +7,17 @@ options, processors, optimizers, checkpoints, resuming, several processes, evalu
 are held out, and pushing to the Hub.
 """
 
+import errno
+import io
 import json
 import math
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import redirect_stderr
 from dataclasses import dataclass, field
 from typing import Any
 
+import torch
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TrainPipelineConfig
@@ -22,14 +26,17 @@ from lerobot.scripts import lerobot_train
 from lerobot.transforms import ImageTransforms
 from lerobot.utils.constants import IMAGENET_STATS
 from lerobot.utils.import_utils import register_third_party_plugins
+from safetensors import SafetensorError
 from torch.utils.data import Subset
 
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
 from robomme_interference_data.errors import HashMismatchError, InvalidOptionError, first_line
 from robomme_interference_data.ids import format_numbers, parse_numbers
+from robomme_interference_data.schema.memory_features import declares_memory
 from robomme_interference_data.schema.sampling import spread
 from robomme_interference_data.storage.files import LocalFiles
+from robomme_interference_data.training.draws import number_from
 from robomme_interference_data.training.history_dataset import HistoryDataset
 
 
@@ -60,6 +67,7 @@ class TrainingData(DatasetConfig):  # type: ignore[misc]
     redraw: bool = False
     unit_episodes: str | None = None
     other_states: str = "refuse"
+    video_backend: str = "pyav"  # unused; LeRobot's default prints a traceback without FFmpeg
 
 
 @dataclass
@@ -94,7 +102,7 @@ def memory_of_policy(config: Any) -> tuple[str, int | None]:
     Raises:
         InvalidOptionError: It declares none.
     """
-    if not (hasattr(config, "memory") and hasattr(config, "image_size")):
+    if not declares_memory(config):
         name = config.type if isinstance(config, PreTrainedConfig) else "of a reward model"
         raise InvalidOptionError(
             f"the policy type {name} has no memory: its configuration lacks the fields `memory` "
@@ -135,8 +143,9 @@ def make_datasets(config: TrainingConfig) -> tuple[HistoryDataset, Any]:
     buffer_set = load_buffer_set(data.root or f"{data.repo_id}@{data.revision}")
     if data.content not in ("", buffer_set.revision):
         raise HashMismatchError(
-            f"{buffer_set.location} was changed since the training began",
-            "Start a new training, or restore the buffer set.",
+            f"{buffer_set.location} has other content than the buffer set with which the training "
+            "began",
+            "Start a new training, or give or restore that buffer set.",
         )
     data.content = buffer_set.revision
     data.conditions = data.conditions or dict.fromkeys(buffer_set.conditions, 1.0)
@@ -174,11 +183,10 @@ def make_datasets(config: TrainingConfig) -> tuple[HistoryDataset, Any]:
     if held_out == len(used):
         expected = f"less: of {len(used)} episodes, none is left to train on"
         raise InvalidOptionError.expected("--dataset.eval_split", data.eval_split, expected)
-    evaluation: Any = make(used[-held_out:], None)
-    if config.max_eval_samples:
-        # LeRobot takes them from its own table of items.
-        evaluation = Subset(evaluation, spread(0, len(evaluation), config.max_eval_samples))
-    return make(used[:-held_out], transforms), evaluation
+    evaluation = make(used[-held_out:], None)
+    # LeRobot chooses them from its own table of items.
+    chosen = spread(0, len(evaluation), config.max_eval_samples or len(evaluation))
+    return make(used[:-held_out], transforms), _HeldOut(evaluation, chosen)
 
 
 def _indices(buffer_set: BufferSet, split: str) -> list[int]:
@@ -186,13 +194,42 @@ def _indices(buffer_set: BufferSet, split: str) -> list[int]:
     return sorted({one.index for one in buffer_set.episode_ids if one.split == split})
 
 
+class _HeldOut(Subset[dict[str, Any]]):
+    """Items to evaluate on, the same ones under the same conditions each time.
+
+    accelerate sets the epoch of a dataset that has one; this has none.
+    """
+
+    dataset: HistoryDataset
+
+    def __getitems__(self, indices: list[int]) -> Any:
+        """Return the items of a batch."""
+        items = super().__getitems__(indices)
+        self.dataset.set_epoch(0)  # that they are taken again is no mistake
+        return items
+
+
 class _Sampler(EpisodeAwareSampler):  # type: ignore[misc]
-    """LeRobot's sampler, which sets the epoch of the data when it begins one, also on resume."""
+    """LeRobot's sampler, which sets the epoch of the data when it begins one, also on resume.
+
+    It sets the state of PyTorch's generator, too: loaders draw from it when they begin, how often
+    depends on their workers, and dropout would differ from that of an uninterrupted training.
+    """
 
     data: HistoryDataset
 
+    def load_state_dict(self, state: dict[str, int]) -> None:
+        """Let the next iteration begin inside an epoch, with the random state of a checkpoint."""
+        super().load_state_dict(state)
+        self._random = torch.get_rng_state()
+
     def __iter__(self) -> Iterator[int]:
         self.data.set_epoch(self._epoch)
+        if self._start_index:
+            torch.set_rng_state(self._random)
+        else:
+            seed = number_from("epoch", self.seed, self._epoch) >> 1
+            torch.default_generator.manual_seed(seed)
         return super().__iter__()
 
 
@@ -232,6 +269,7 @@ def train(arguments: Sequence[str]) -> None:
     Raises:
         InvalidOptionError: LeRobot does not accept them, or the policy declares no memory.
         HashMismatchError: The training is resumed, but the buffer set has changed.
+        OSError: A checkpoint cannot be written. The one before is complete.
     """
 
     def datasets(config: TrainingConfig) -> tuple[HistoryDataset, Any]:
@@ -239,19 +277,45 @@ def train(arguments: Sequence[str]) -> None:
         lerobot_train.EpisodeAwareSampler = type("Sampler", (_Sampler,), {"data": made[0]})
         return made
 
-    @parser.wrap()  # type: ignore[untyped-decorator]
-    def run(config: TrainingConfig) -> None:
-        # Without the parser of LeRobot's own settings around it.
-        lerobot_train.train.__wrapped__(config)
-
     replaced = lerobot_train.make_train_eval_datasets, lerobot_train.EpisodeAwareSampler, sys.argv
     lerobot_train.make_train_eval_datasets = datasets
     # LeRobot also reads some options here after it has parsed all.
     sys.argv = ["lerobot-train", *arguments]
     try:
         register_third_party_plugins()
-        run()
+        settings = _settings()
+        try:
+            # Without the parser of LeRobot's own settings around it.
+            lerobot_train.train.__wrapped__(settings)
+        except SafetensorError as error:  # such as on a full disk
+            raise OSError(errno.EIO, f"a checkpoint cannot be written: {error}") from error
     finally:
         (lerobot_train.make_train_eval_datasets, lerobot_train.EpisodeAwareSampler, sys.argv) = (
             replaced
         )
+
+
+def _settings() -> TrainingConfig:
+    """Return the settings that the options in `sys.argv` give.
+
+    Raises:
+        InvalidOptionError: There is no such option, or it has no such value.
+    """
+
+    @parser.wrap()  # type: ignore[untyped-decorator]
+    def settings(config: TrainingConfig) -> TrainingConfig:
+        return config
+
+    printed = io.StringIO()
+    try:
+        with redirect_stderr(printed):
+            made: TrainingConfig = settings()
+    except SystemExit as end:
+        if not end.code:  # after --help
+            raise
+        # The parser prints its usage, hundreds of lines, in front of the error.
+        what = printed.getvalue().rpartition("error: ")[2].strip()
+        raise InvalidOptionError(
+            f"lerobot-train: {what}", "Its options are listed by: lerobot-train --help"
+        ) from None
+    return made

@@ -1,9 +1,11 @@
-"""Batches for the loaders of PyTorch, which ask a dataset for the items of a batch together."""
+"""What PyTorch's loaders need of a dataset: whole batches, and errors that they can report."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from torch.utils.data._utils.collate import collate, default_collate_fn_map
+
+from robomme_interference_data.errors import InterferenceError
 
 
 class Item(dict[str, Any]):
@@ -52,3 +54,28 @@ def _collate(items: Sequence[Item], *, collate_fn_map: Any = None) -> dict[str, 
 
 
 default_collate_fn_map[Item] = _collate  # where PyTorch looks for the types of others
+
+
+class Unusable:
+    """A dataset that another process cannot open again.
+
+    A loader reports errors of items in the process that trains, but an error while a dataset is
+    unpickled only ends its worker.
+    """
+
+    def __init__(self, error: InterferenceError):
+        self._error = error
+
+    def __getitem__(self, index: object) -> Any:
+        raise self._error
+
+    def __getitems__(self, indices: Sequence[int]) -> Any:
+        raise self._error
+
+
+def made_or_unusable[T](make: Callable[..., T], *arguments: Any) -> T | Unusable:
+    """Return what a function makes, or what raises its error when an item is taken."""
+    try:
+        return make(*arguments)
+    except InterferenceError as error:
+        return Unusable(error)
