@@ -121,18 +121,20 @@ def playing_days() -> Iterator[None]:
         yield
 
 
-def plan_of(kind: str, numbers: tuple[int, ...] = NUMBERS) -> DatasetPlan:
+def plan_of(
+    kind: str, numbers: tuple[int, ...] = NUMBERS, cameras: tuple[str, ...] = ("front",)
+) -> DatasetPlan:
     """The plan of a dataset of days of eight tasks."""
-    units = kind in UNITS
     source = open_source("tabletop-day:8", kind=kind)
-    split, chosen = ("train", (0,)) if units else ("test", numbers)
+    split, chosen = ("train", (0,)) if kind in UNITS else ("test", numbers)
     episodes = choose_episodes((source,), split=split, numbers=chosen)
-    return DatasetPlan(kind, (source,), episodes, cameras=("front",), unit=Unit(4, 2))
+    return DatasetPlan(kind, (source,), episodes, cameras=cameras, unit=Unit(4, 2))
 
 
-def build_days(root: Path) -> None:
-    """Build a buffer set of two days."""
+def build_days(root: Path, *further: str, **options: Any) -> None:
+    """Build a buffer set of two days, with further datasets; options are those of `plan_of`."""
     with playing_days():
-        for kind in DATASETS:
-            build_dataset(plan_of(kind), root / kind, Serial(), WorkProgress(quiet=True))
+        for kind in (*DATASETS, *further):
+            plan = plan_of(kind, **options)
+            build_dataset(plan, root / kind, Serial(), WorkProgress(quiet=True))
     plan_again(root, CONDITIONS)

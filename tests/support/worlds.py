@@ -104,7 +104,7 @@ class World:
         self.drawn += observe
         return Observation(self.seen.images if observe else {}, self.seen.state), status
 
-    def act(self, policy: str) -> NDArray[np.float32]:
+    def act(self, policy: str, known: Any = None) -> NDArray[np.float32]:
         return np.append(self.answer[:7], np.float32(1.0))
 
     def subgoal(self) -> Subgoal:

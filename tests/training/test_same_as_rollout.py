@@ -9,6 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from support.buffer_sets import copy_buffer_set, plan_again
+from support.days import DATASETS, build_days
 from support.retrieval import make_index
 from support.runs import config
 from support.worlds import BUFFER_SET
@@ -73,24 +74,21 @@ class Watching(Policy):
         return {}
 
 
-@pytest.mark.parametrize("memory", ["framesamp:8", "window:2@2.5", "full"])
-@pytest.mark.parametrize(
-    "condition, retrieval",
-    [("no-history", None), ("k0", None), ("before-k3", None), ("before-k3", "thumbnail")],
-)
-def test_same_frames_states_and_positions(
-    memory: str,
-    condition: str,
-    retrieval: str | None,
+def compare(
     buffers: Path,
-    tmp_path_factory: pytest.TempPathFactory,
+    episode: EpisodeId,
+    condition: str,
+    memory: str,
+    retrieval: str | None,
+    cache: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:
+) -> list[int]:
+    """Compare what a policy receives with the items of training; return the moments it acted."""
     monkeypatch.setenv(BUFFER_SET, str(buffers))
     buffer_set, policy = load_buffer_set(buffers), Watching(memory)
     run_rollout(
         RunContext(config(), "mine", SystemFacts(), buffer_set.name, buffer_set.revision),
-        WorkItem(condition, EPISODE),
+        WorkItem(condition, episode),
         simulator=Recordings(str(buffers), CAMERAS),
         policy=policy,
         buffer_set=buffer_set,
@@ -104,12 +102,11 @@ def test_same_frames_states_and_positions(
         cameras=CAMERAS,
         image_size=24,
         retrieval=retrieval,
-        cache=tmp_path_factory.getbasetemp() / "store",
+        cache=cache,
         quiet=True,
     )
-    assert len(policy.moments) == 14 and max(policy.moments) == 208
     for moment, (kept, frames, states) in policy.moments.items():
-        item, count = data[data.index_of(EPISODE, moment)], len(kept) - 1
+        item, count = data[data.index_of(episode, moment)], len(kept) - 1
         assert (~item["memory.is_pad"]).sum() == count
         assert [*item["memory.position"][:count], item["position"]] == kept
         assert torch.equal(item["memory.state"][:count], torch.from_numpy(states[:-1]))
@@ -118,3 +115,36 @@ def test_same_frames_states_and_positions(
             small = torch.from_numpy(resize(frames[name], 24))
             assert torch.equal(item[f"memory.images.{name}"][:count], small[:-1])
             assert torch.equal(item[f"observation.images.{name}"], small[-1])
+    return [*policy.moments]
+
+
+@pytest.mark.parametrize("memory", ["framesamp:8", "window:2@2.5", "full"])
+@pytest.mark.parametrize(
+    "condition, retrieval",
+    [("no-history", None), ("k0", None), ("before-k3", None), ("before-k3", "thumbnail")],
+)
+def test_same_frames_states_and_positions(
+    memory: str,
+    condition: str,
+    retrieval: str | None,
+    buffers: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    cache = tmp_path_factory.getbasetemp() / "store"
+    moments = compare(buffers, EPISODE, condition, memory, retrieval, cache, monkeypatch)
+    assert len(moments) == 14 and max(moments) == 208
+
+
+def test_of_days(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    root, query = tmp_path / "buffers", EpisodeId("VideoPlaceButton", "test", 0)
+    build_days(root, "executions", numbers=(0,), cameras=CAMERAS)
+    make_index(root, names=DATASETS)
+    for condition, memory, retrieval in (
+        ("day-k0", "framesamp:8", None),
+        ("day-k2", "full", None),
+        ("day-cut-k2", "window:2@2.5", None),
+        ("day-k2", "full", "thumbnail"),
+    ):
+        cache = tmp_path / "store"
+        assert compare(root, query, condition, memory, retrieval, cache, monkeypatch) == [0]
