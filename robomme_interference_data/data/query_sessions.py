@@ -205,8 +205,8 @@ class QuerySessions:
         further = len(tasks) - 1 - asked.task
         if k > further:
             raise BuildError(
-                f"{query} is shown {further} tasks before the end of {record.episode_id}; a "
-                f"condition needs {k} further tasks",
+                f"{further} tasks of {record.episode_id} follow after {query} can be asked; a "
+                f"condition needs {k}",
                 f"Choose {named('conditions')} with fewer, or build longer days.",
             )
         stop = tasks[asked.task + k].stop
