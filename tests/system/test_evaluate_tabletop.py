@@ -135,7 +135,9 @@ def test_the_example_policy_learns_to_act(
     """It is trained on one execution, and carries it out from the lesson."""
     monkeypatch.syspath_prepend(str(EXAMPLE))
     run = tmp_path / "run"
-    options = "--split test --task act --conditions k0 --noise 0.005 --learning-rate 2e-3 --device cpu"
+    options = (
+        "--split test --task act --conditions k0 --noise 0.005 --learning-rate 2e-3 --device cpu"
+    )
     small = "--steps 400 --batch 16 --image-size 16"
     program = [sys.executable, EXAMPLE / "train.py", buffer_set, "--out", run]
     program += [*options.split(), *small.split()]
