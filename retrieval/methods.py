@@ -17,7 +17,7 @@ from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.schema.sampling import runs
 
 from .measure import Similarities
-from .segment import FrameSpan, closest_cosines
+from .segment import FrameSpan, highest_cosine
 
 _CHANGE_FRAMES = UNIT_FRAMES
 """Frames on each side of a border that `changes` compares (ours): as many as a distractor unit has.
@@ -127,8 +127,13 @@ def _joined(measured: Similarities, parts: Parts) -> list[FrameSpan]:
     if not len(following):  # a single frame has no adjacent cosine
         return [first]
     limit = np.quantile(following, _FOLLOWING, method="lower")
-    alike = closest_cosines(measured.embeddings(), first) >= limit
-    return [span for span in parts.segments if span == first or alike[slice(*span)].any()]
+    rows = measured.embeddings()
+    inside = rows[slice(*first)]
+    return [
+        span
+        for span in parts.segments
+        if span == first or highest_cosine(rows[slice(*span)], inside) >= limit
+    ]
 
 
 def _random(measured: Similarities, parts: Parts) -> list[FrameSpan]:

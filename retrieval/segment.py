@@ -68,12 +68,10 @@ def side_cosines(embeddings: NDArray[np.floating], width: int) -> NDArray[np.flo
     return found
 
 
-def closest_cosines(embeddings: NDArray[np.floating], span: FrameSpan) -> NDArray[np.float32]:
-    """Return the cosine of each embedding with the closest one of a span, `(T,) float32`."""
-    rows = embeddings.astype(np.float32, copy=False)
-    inside = rows[slice(*span)].T
-    blocks = (rows[start : start + _BLOCK] for start in range(0, len(rows), _BLOCK))
-    return np.concatenate([np.round(block @ inside, _DIGITS).max(axis=1) for block in blocks])
+def highest_cosine(embeddings: NDArray[np.float32], others: NDArray[np.float32]) -> float:
+    """Return the highest cosine of two embeddings, one of `(T, D)` and one of `(S, D)`."""
+    blocks = (embeddings[start : start + _BLOCK] for start in range(0, len(embeddings), _BLOCK))
+    return max(float(np.round(block @ others.T, _DIGITS).max()) for block in blocks)
 
 
 def segments(
