@@ -57,8 +57,8 @@ def side_cosines(embeddings: NDArray[np.floating], width: int) -> NDArray[np.flo
         values = embeddings[:, start : start + _BLOCK // 16]
         sums = np.zeros((length + 1, values.shape[1]))
         np.cumsum(values, axis=0, dtype=np.float64, out=sums[1:])
-        sums = sums[width:] - sums[:-width]
-        left, right = sums[:-width], sums[width:]
+        sides = sums[width:] - sums[:-width]
+        left, right = sides[:-width], sides[width:]
         products += np.einsum("td,td->t", left, right)
         before += np.einsum("td,td->t", left, left)
         after += np.einsum("td,td->t", right, right)

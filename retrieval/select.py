@@ -6,7 +6,7 @@ Every rule is a function of the history's embeddings and that of the first live 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal, Self
+from typing import Any, Final, Literal, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,14 +89,12 @@ class Rule:
                 pass  # a word, or a number of the next kind
         return cls(name, number)
 
-    def cosine(self, typical: float) -> float | None:
-        """Return the cosine below which it cuts; unrelated frames have the cosine `typical`.
+    def cosine(self, typical: float) -> float:
+        """Return the cosine below which a method that cuts does so.
 
-        None if it does not cut.
+        Unrelated frames have the cosine `typical`.
         """
-        if self.method.sides is None or self.number is None:
-            return None
-        return (1 + typical) / 2 if self.number == ADAPTIVE else float(self.number)
+        return (1 + typical) / 2 if self.number == ADAPTIVE else float(cast("float", self.number))
 
     def __str__(self) -> str:
         """Return the text that `parse` reads, with every digit of the number."""
@@ -151,9 +149,11 @@ def choose(measured: Similarities, rule: Rule) -> Choice:
             f"{measured.episode_id} under {measured.condition}: the history is empty",
             "Retrieval needs a condition with a history, such as k0; leave out no-history.",
         )
-    method, threshold = rule.method, rule.cosine(measured.typical)
+    method = rule.method
+    threshold: float | None = None
     cut: tuple[FrameSpan, ...] = ()
-    if method.sides is not None and threshold is not None:
+    if method.sides is not None:
+        threshold = rule.cosine(measured.typical)
         cut = segments(measured.borders(method.sides), threshold, method.sides)
     # If all segments are short, all may be chosen (ours).
     candidates = [(a, b) for a, b in cut if b - a >= MIN_FRAMES] or list(cut)

@@ -71,13 +71,16 @@ class Selector(RetrievalStep):
             it is here, None for a rule that does not cut.
         """
         index = self._index(buffer)
+        cosine = None
+        if self.rule.method.sides is not None:
+            cosine = self.rule.cosine(index.units.typical_cosine)
         return {
             "encoder": index.units.header.encoder.name,
             "fingerprint": index.units.header.encoder.sha256,
             "camera": index.units.header.camera,
             "method": self.rule.name,
             "number": self.rule.number,
-            "cosine": self.rule.cosine(index.units.typical_cosine),
+            "cosine": cosine,
         }
 
     def select(self, buffer: Buffer, image: NDArray[np.uint8]) -> NDArray[np.int64]:
