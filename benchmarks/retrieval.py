@@ -38,7 +38,8 @@ from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.encoders import Encoder, make_encoder
 from robomme_interference_data.retrieval.grade import cells, grade
 from robomme_interference_data.retrieval.index import build_index
-from robomme_interference_data.retrieval.select import Rule, choose, measure
+from robomme_interference_data.retrieval.measure import measure
+from robomme_interference_data.retrieval.select import Rule, choose
 from robomme_interference_data.storage.files import LocalFiles, write_json
 from robomme_interference_data.storage.text import read_json
 

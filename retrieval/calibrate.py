@@ -19,7 +19,8 @@ from robomme_interference_data.schema.conditions import in_order
 from robomme_interference_data.viz.tables import Columns, Table
 
 from .grade import ALL, grade
-from .select import Rule, Similarities
+from .measure import Similarities
+from .select import Rule
 
 _DIGITS = 6
 
@@ -151,7 +152,7 @@ def _trial(
     measured: Sequence[Similarities], threshold: float, *, family: str = ALL, condition: str = ALL
 ) -> Trial:
     grades = [
-        grade(buffer, Rule(threshold=threshold))
+        grade(buffer, Rule(number=threshold))
         for buffer in measured
         if family in (ALL, buffer.episode_id.family) and condition in (ALL, buffer.condition)
     ]

@@ -32,7 +32,7 @@ from robomme_interference_data.schema.shifts import NO_SHIFT, SHIFT_HELP, parse_
 from .config import ENCODER_HELP, RETRIEVAL, IndexConfig
 
 if TYPE_CHECKING:
-    from .select import Similarities
+    from .measure import Similarities
 
 _CALIBRATION = "Calibration"
 
@@ -134,6 +134,7 @@ def retrieve(
     from robomme_interference_data.schema.codec import to_dict
 
     from . import drawing, encoders, explain, select
+    from .measure import measure
 
     check_output(out)
     name = encoders.encoder_name(encoder)
@@ -142,9 +143,9 @@ def retrieve(
     buffer = opened.load(episode, condition)
     camera = buffer.query.dataset.camera(camera)
     query = live_embedding(opened, buffer, under, name, camera)
-    measured = select.measure(buffer, name, camera, query)
+    measured = measure(buffer, name, camera, query)
     choice = select.choose(measured, parsed)
-    explanation = explain.explain(buffer, measured, choice, parsed, name, camera)
+    explanation = explain.explain(buffer, measured, choice, name, camera)
     if out is not None:
         live = live_frame(opened, buffer, under, camera)
         drawing.draw_retrieval(buffer, measured, choice, explanation, live, out)
@@ -161,9 +162,10 @@ def retrieval_score(
     rules: Annotated[
         list[str],
         typer.Option(
-            help="Rules METHOD or METHOD/THRESHOLD, or all. METHOD is max (released rule), latest, "
-            "joined, mean, last, random, top32 or oracle; THRESHOLD is a cosine or adaptive, by "
-            "default the one published for the encoder.",
+            help="Rules METHOD or METHOD/NUMBER, or all. METHOD is max (released rule), latest, "
+            "joined, mean, changes, last or random, whose NUMBER is a threshold, a cosine or "
+            "adaptive, by default the one published for the encoder; window, windows3 or top, "
+            "whose NUMBER is one of frames; or oracle.",
             metavar="RULE,…",
             rich_help_panel=RETRIEVAL,
         ),

@@ -11,8 +11,9 @@ from robomme_interference_data.viz.figure import GRAY, INK, Page, ink_on, open_p
 from robomme_interference_data.viz.filmstrip import LESSON_COLOR, mark_evidence, session_colors
 
 from .explain import Explanation, frames_text
+from .measure import Similarities
 from .segment import FrameSpan
-from .select import MIN_FRAMES, Choice, Similarities
+from .select import MIN_FRAMES, Choice
 
 # Inches.
 _WIDTH, _HEIGHT = 7.2, 6.1
@@ -138,18 +139,22 @@ def _axes(page: Page, measured: Similarities, top: float) -> Any:
 
 
 def _draw_adjacent(axes: Any, buffer: Buffer, measured: Similarities, choice: Choice) -> None:
-    """Draw the cosine of each frame with the next, the threshold, and the cuts."""
-    values, threshold = measured.adjacent, choice.threshold
-    frames = np.arange(1, len(values) + 1)  # a cut lies before this frame
-    axes.plot(frames, values, color=_CURVE_INK, linewidth=0.9)
-    label = f"threshold {threshold:.3f}"
-    axes.axhline(threshold, color="black", linewidth=0.9, linestyle="--", label=label)
-    cuts = values < threshold
-    label = f"{int(cuts.sum())} cuts"
-    axes.plot(frames[cuts], values[cuts], "v", color="black", markersize=4, label=label)
+    """Draw the cosine of both sides of each border, the threshold, and the cuts."""
+    sides = choice.rule.method.sides or 1
+    values = measured.borders(sides)
+    axes.plot(np.arange(1, len(values) + 1), values, color=_CURVE_INK, linewidth=0.9)
+    if choice.threshold is not None:
+        label = f"threshold {choice.threshold:.3f}"
+        axes.axhline(choice.threshold, color="black", linewidth=0.9, linestyle="--", label=label)
+        cuts = np.array([start for start, _ in choice.segments[1:]], int)
+        label = f"{len(cuts)} cuts"
+        axes.plot(cuts, values[cuts - 1], "v", color="black", markersize=4, label=label)
     axes.tick_params(labelbottom=False)
+    compared = "each frame with the next"
+    if sides > 1:
+        compared = f"the means of the {sides} frames before and after"
     evidence = "; dark line above: evidence" if buffer.evidence else ""
-    _title(axes, f"cosine of each frame with the next; shaded: the true lesson{evidence}")
+    _title(axes, f"cosine of {compared}; shaded: the true lesson{evidence}")
 
 
 def _draw_similarity(
@@ -207,6 +212,8 @@ def _draw_compared(
 
 def _title(axes: Any, title: str) -> None:
     axes.set_title(title, loc="left", size=6.5, color=INK, pad=2)
+    if not axes.get_legend_handles_labels()[0]:  # a rule without cuts has no threshold
+        return
     legend = axes.legend(
         loc="lower right", bbox_to_anchor=(1.005, 0.985), ncols=2, frameon=False, fontsize=6,
         borderpad=0, borderaxespad=0, handlelength=1.6, columnspacing=1.2,

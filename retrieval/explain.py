@@ -9,8 +9,9 @@ from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.viz.tables import percent
 
 from .grade import Grade, grade
+from .measure import Similarities
 from .segment import FrameSpan
-from .select import METHODS, Choice, Rule, Similarities
+from .select import Choice, Rule
 
 
 @dataclass(frozen=True)
@@ -45,9 +46,15 @@ class Explanation:
 
     def text(self) -> str:
         """Return the explanation in a few lines."""
-        graded, method = self.grade, self.grade.rule.partition("/")[0]
+        graded, rule = self.grade, Rule.parse(self.grade.rule)
         score = "" if self.score is None else f", {self.score:.3f}"
-        parts = f"{graded.segments} segment{'s' if graded.segments > 1 else ''}"
+        cut = "not cut"
+        if rule.method.sides is not None:
+            sides = "adjacent frames"
+            if rule.method.sides > 1:
+                sides = f"the means of the {rule.method.sides} frames before and after"
+            parts = f"{graded.segments} segment{'s' if graded.segments > 1 else ''}"
+            cut = f"cut into {parts} where the cosine of {sides} is below {graded.threshold:.3f}"
         outside = "all frames are chosen"
         if self.other is not None:
             source = f"frame {self.other} of {self.other_source}"
@@ -55,10 +62,9 @@ class Explanation:
         lesson = frames_text(self.lesson)
         lines = (
             f"{graded.episode_id} under {graded.condition}, {self.camera} camera, rule "
-            f"{graded.rule}: {graded.history_frames} history frames, cut into {parts} where the "
-            f"cosine of adjacent frames is below {graded.threshold:.3f}",
+            f"{graded.rule}: {graded.history_frames} history frames, {cut}",
             f"Chosen: frames {frames_text(self.chosen)}, of {', '.join(self.sessions)}",
-            f"Why: {method} takes {METHODS[method]}{score}",
+            f"Why: {rule.name} takes {rule.method.chooses}{score}",
             f"The first live observation is closest to frame {self.closest} of these, with cosine "
             f"{self.cosine:.3f}; {outside}",
             f"The lesson is frames {lesson}: {self.graded()}" if lesson else self.graded(),
@@ -83,7 +89,7 @@ def frames_text(spans: Sequence[FrameSpan]) -> str:
 
 
 def explain(
-    buffer: Buffer, measured: Similarities, choice: Choice, rule: Rule, encoder: str, camera: str
+    buffer: Buffer, measured: Similarities, choice: Choice, encoder: str, camera: str
 ) -> Explanation:
     """Explain a choice."""
     alike, frames = measured.alike, choice.frames
@@ -95,7 +101,7 @@ def explain(
     return Explanation(
         encoder,
         camera,
-        grade(measured, rule),
+        grade(measured, choice.rule),
         choice.spans,
         max(scores, default=None),
         tuple(f"{session.role} {session.source}" for session in touched),

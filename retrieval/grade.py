@@ -20,7 +20,8 @@ from robomme_interference_data.stats.bootstrap import bootstrap
 from robomme_interference_data.stats.intervals import wilson
 from robomme_interference_data.viz.tables import Columns, Table, percent, record_columns
 
-from .select import Rule, Similarities, choose
+from .measure import Similarities
+from .select import Rule, choose
 
 PASS_MARK = 0.9
 """Minimum mean purity and mean coverage of a cell that passes (released reference)."""
@@ -34,12 +35,12 @@ class Grade:
     """How well one rule chose for one buffer.
 
     Attributes:
-        rule: The rule with its threshold.
-        threshold: Cosine below which it cut.
+        rule: The rule with its number.
+        threshold: Cosine below which it cut; None if it does not cut.
         episode_id: The query episode.
         condition: Name of the condition.
         history_frames: Frames of the history.
-        segments: Number of segments.
+        segments: Number of segments; 0 if it does not cut.
         start: First chosen frame.
         stop: Frame after the last chosen one.
         chosen_frames: Number of chosen frames; there may be gaps.
@@ -55,7 +56,7 @@ class Grade:
     """
 
     rule: str
-    threshold: float
+    threshold: float | None
     episode_id: EpisodeId
     condition: str
     history_frames: int

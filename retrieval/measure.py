@@ -1,15 +1,84 @@
-"""Measure all buffers of a buffer set, to grade what retrieval would choose of them."""
+"""Measure buffers: the cosines from which retrieval chooses, and the truth to grade it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.views import live_embedding
 from robomme_interference_data.errors import InvalidOptionError
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.progress import WorkProgress
+from robomme_interference_data.schema.evidence import Evidence
+from robomme_interference_data.schema.manifest import Session
 from robomme_interference_data.schema.shifts import Shift
 
-from .select import Similarities, measure
+from .segment import FrameSpan, adjacent_cosines, cosines, side_cosines
+
+
+@dataclass(frozen=True, eq=False)
+class Similarities:
+    """Cosines of the frames of a buffer, with each other and with the first live observation.
+
+    Attributes:
+        episode_id: The query episode.
+        condition: Name of the condition.
+        sessions: The true sessions in order.
+        adjacent: Cosine of each frame with the next, `(T - 1,) float32`.
+        alike: Cosine of each frame with that observation's image, `(T,) float32`.
+        typical: Median cosine of two frames of different distractor units.
+        embeddings: Returns the embeddings, `(T, D) float32`. It reads them again, because they take
+            much memory for many buffers.
+        evidence: Frames that show the hidden answer; None if unknown.
+    """
+
+    episode_id: EpisodeId
+    condition: str
+    sessions: tuple[Session, ...]
+    adjacent: NDArray[np.float32]
+    alike: NDArray[np.float32]
+    typical: float
+    embeddings: Callable[[], NDArray[np.float32]]
+    evidence: tuple[Evidence, ...] | None = None
+
+    @property
+    def lesson(self) -> tuple[FrameSpan, ...]:
+        """The parts of the true lesson, in the buffer's order; none where it is absent."""
+        return tuple(
+            (session.start, session.stop) for session in self.sessions if session.role == "lesson"
+        )
+
+    def borders(self, width: int) -> NDArray[np.float32]:
+        """Return the cosines of both sides of each border, see `side_cosines`."""
+        return self.adjacent if width == 1 else side_cosines(self.embeddings(), width)
+
+
+def measure(
+    buffer: Buffer,
+    encoder: str,
+    camera: str | None = None,
+    query: NDArray[np.floating] | None = None,
+) -> Similarities:
+    """Return the similarities of a buffer from its stored embeddings.
+
+    `query` is the embedding of the first live observation, `(D,)`, of length 1, such as under a
+    shift; None for the stored one.
+    """
+    embeddings = buffer.embeddings(encoder, camera)
+    return Similarities(
+        buffer.episode_id,
+        buffer.condition,
+        buffer.sessions,
+        adjacent_cosines(embeddings),
+        cosines(embeddings, buffer.query_embedding(encoder, camera) if query is None else query),
+        buffer.index(encoder, camera).units.typical_cosine,
+        lambda: buffer.embeddings(encoder, camera),
+        buffer.evidence,
+    )
 
 
 def measure_all(

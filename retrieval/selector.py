@@ -13,7 +13,8 @@ from robomme_interference_data.data.index_layout import index_folder
 from robomme_interference_data.errors import InvalidOptionError
 
 from .encoders import check_encoder, encoder_name, make_encoder, published_threshold
-from .select import Rule, choose, measure
+from .measure import measure
+from .select import Rule, choose
 
 
 class RetrievalStep:
@@ -66,16 +67,20 @@ class Selector(RetrievalStep):
 
         Returns:
             `encoder`, the name; `fingerprint`, the SHA-256 over everything that determines the
-            features; `camera`; `method`; `threshold`; and `cosine`, the number that it is here.
+            features; `camera`; `method` and `number` of the rule; and `cosine`, the threshold that
+            it is here, None for a rule that does not cut.
         """
         index = self._index(buffer)
+        cosine = None
+        if self.rule.method.sides is not None:
+            cosine = self.rule.cosine(index.units.typical_cosine)
         return {
             "encoder": index.units.header.encoder.name,
             "fingerprint": index.units.header.encoder.sha256,
             "camera": index.units.header.camera,
-            "method": self.rule.method,
-            "threshold": self.rule.threshold,
-            "cosine": self.rule.cosine(index.units.typical_cosine),
+            "method": self.rule.name,
+            "number": self.rule.number,
+            "cosine": cosine,
         }
 
     def select(self, buffer: Buffer, image: NDArray[np.uint8]) -> NDArray[np.int64]:

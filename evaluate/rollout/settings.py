@@ -154,7 +154,7 @@ def _fault_of_published_name(config: RunConfig, kind: PolicyKind, system: System
             f"system {system.name} has {expected} retrieval step, and {named('retrieval')} is "
             f"{config.retrieval}"
         )
-    if has_step and Rule.parse(config.retrieval_rule).method != "max":
+    if has_step and Rule.parse(config.retrieval_rule).name != "max":
         return f"the retrieval step of {system.name} has the rule max, not {config.retrieval_rule}"
     return None
 

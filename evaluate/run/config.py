@@ -33,7 +33,7 @@ class RetrievalConfig:
         None, group=_RETRIEVAL, help="Encoder of a retrieval step: thumbnail, siglip or siglip:ID."
     )
     retrieval_rule: str = setting(
-        "max", group=_RETRIEVAL, help="METHOD or METHOD/THRESHOLD, as for retrieval-score."
+        "max", group=_RETRIEVAL, help="METHOD or METHOD/NUMBER, as for retrieval-score."
     )
     retrieval_camera: str | None = setting(
         None,

@@ -202,7 +202,8 @@ def _write_page(
     from robomme_interference_data.data.views import live_embedding
     from robomme_interference_data.retrieval.encoders import published_threshold
     from robomme_interference_data.retrieval.explain import explain
-    from robomme_interference_data.retrieval.select import Rule, choose, measure
+    from robomme_interference_data.retrieval.measure import measure
+    from robomme_interference_data.retrieval.select import Rule, choose
     from robomme_interference_data.viz.buffer_page import RetrievedPart, write_page
 
     cameras, retrieved = tuple(live), []
@@ -216,7 +217,7 @@ def _write_page(
             print_status(f"The page does not show retrieval by {name}: {error.message}")
             continue
         choice = choose(measured, rule)
-        grade = explain(buffer, measured, choice, rule, name, cameras[0]).graded()
+        grade = explain(buffer, measured, choice, name, cameras[0]).graded()
         retrieved.append(RetrievedPart(f"{name}/{rule}", choice.frames.tolist(), grade))
     buffer.fetch(cameras)
     size = write_page(opened, buffer, html, live, retrieved)

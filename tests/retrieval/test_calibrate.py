@@ -11,7 +11,8 @@ from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.retrieval import charts
 from robomme_interference_data.retrieval.calibrate import Calibration, Trial, calibrate
 from robomme_interference_data.retrieval.grade import ALL
-from robomme_interference_data.retrieval.select import Rule, Similarities
+from robomme_interference_data.retrieval.measure import Similarities
+from robomme_interference_data.retrieval.select import Rule
 
 
 def found_in(*measured: Similarities, sweep: tuple[float, ...] = (0.5,)) -> Calibration:

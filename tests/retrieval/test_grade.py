@@ -71,10 +71,10 @@ def test_the_lesson_may_lie_anywhere(
 def test_single_frames_are_graded_too() -> None:
     spans = ((0, 20), (20, 52), (52, 84))
     high = {n: 0.9 for n in range(10)} | {n: 0.8 for n in range(60, 82)}
-    found = grade(made(cuts={}, high=high, spans=spans), Rule("top32", 0.5))
+    found = grade(made(cuts={}, high=high, spans=spans), Rule("top"))
     assert (found.start, found.stop, found.chosen_frames) == (0, 82, 32)
     assert (found.purity, found.coverage, found.false_sessions) == (10 / 32, 10 / 20, 1)
-    parted = grade(made(cuts={}, high=high, spans=spans, lessons=(0, 2)), Rule("top32", 0.5))
+    parted = grade(made(cuts={}, high=high, spans=spans, lessons=(0, 2)), Rule("top"))
     assert (parted.purity, parted.coverage, parted.false_sessions) == (1, 32 / 52, 0)
 
 

@@ -19,8 +19,8 @@ from robomme_interference_data.data.embeddings import EmbeddingIndex, normalized
 from robomme_interference_data.errors import BuildError, MissingFileError
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
+from robomme_interference_data.retrieval.measure import measure
 from robomme_interference_data.retrieval.segment import typical_cosine
-from robomme_interference_data.retrieval.select import measure
 from robomme_interference_data.storage.staging import file_lock, staging_path
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "index"

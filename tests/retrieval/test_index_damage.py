@@ -17,7 +17,7 @@ from robomme_interference_data.data.embeddings import BufferSetIndex, open_index
 from robomme_interference_data.data.index_layout import episode_file
 from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
-from robomme_interference_data.retrieval.select import measure
+from robomme_interference_data.retrieval.measure import measure
 from robomme_interference_data.retrieval.selector import Selector
 from robomme_interference_data.storage.files import format_sums, read_sums, sha256_file
 

@@ -8,13 +8,14 @@ from support.messages import raises
 from support.retrieval import embedded, made
 
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
+from robomme_interference_data.retrieval.methods import METHODS
 from robomme_interference_data.retrieval.segment import (
     adjacent_cosines,
     cosines,
     segments,
     typical_cosine,
 )
-from robomme_interference_data.retrieval.select import METHODS, Rule, choose, parse_rules
+from robomme_interference_data.retrieval.select import Rule, choose, parse_rules
 
 X, Y, Z = np.eye(3, dtype=np.float16)
 MIXED = np.array([0.6, 0.8, 0], np.float16)  # cosine 0.6 with X, 0.8 with Y
@@ -62,10 +63,17 @@ def test_what_unrelated_frames_share() -> None:
     assert typical(HISTORY) == 0
 
 
-@given(st.sampled_from(sorted(METHODS)), st.one_of(st.just("adaptive"), st.floats(-1, 1)))
-def test_rules_are_read_as_they_are_written(method: str, cut: float) -> None:
-    rule = Rule(method, cut)
+@given(
+    st.sampled_from(sorted(METHODS)),
+    st.one_of(st.just("adaptive"), st.floats(-1, 1)),
+    st.integers(1),
+)
+def test_rules_are_read_as_they_are_written(name: str, threshold: float, frames: int) -> None:
+    method = METHODS[name]
+    number: float | None = threshold if method.sides else frames if method.frames else None
+    rule = Rule(name, number)
     assert Rule.parse(str(rule)) == rule
+    assert Rule.parse(str(Rule(name))) == Rule.parse(name) == Rule(name)
 
 
 def test_the_cut_is_the_encoders_own_unless_given() -> None:
@@ -80,10 +88,14 @@ def test_the_cut_is_the_encoders_own_unless_given() -> None:
 
 
 def test_all_rules() -> None:
-    own = [f"{method}/0.923" for method in METHODS]
-    assert [str(rule) for rule in parse_rules(["all"], 0.923)] == [*own, "max/adaptive"]
-    adaptive = [f"{method}/adaptive" for method in METHODS]  # max/adaptive once
-    assert [str(rule) for rule in parse_rules(["all", "max"], None)] == adaptive
+    own = ("max", "latest", "joined", "mean", "last", "random")
+    others = {"changes/adaptive", "window/128", "windows3/128", "top/32", "oracle"}
+    published = [str(rule) for rule in parse_rules(["all"], 0.923)]
+    assert published[-1] == "max/adaptive"
+    assert {*published[:-1]} == {f"{name}/0.923" for name in own} | others
+    adaptive = [str(rule) for rule in parse_rules(["all", "max"], None)]  # max/adaptive once
+    assert len(adaptive) == len(METHODS)
+    assert {*adaptive} == {f"{name}/adaptive" for name in own} | others
 
 
 @pytest.mark.parametrize(
@@ -92,6 +104,10 @@ def test_all_rules() -> None:
         ("maximum", UnknownNameError),
         ("max/high", InvalidOptionError),
         ("max/1.5", InvalidOptionError),
+        ("window/adaptive", InvalidOptionError),
+        ("window/0", InvalidOptionError),
+        ("windows3/2.5", InvalidOptionError),
+        ("oracle/0.5", InvalidOptionError),
     ],
 )
 def test_rules_that_are_none(text: str, error: type[Exception]) -> None:
@@ -108,7 +124,6 @@ def test_rules_that_are_none(text: str, error: type[Exception]) -> None:
         ("max", Z, (0, 4)),  # Z's own segment is too short; the others tie at 0
         ("mean", Y, (4, 9)),
         ("last", X, (11, 15)),
-        ("oracle", Y, (0, 4)),
     ],
 )
 def test_choosing(method: str, query: np.ndarray, span: tuple[int, int]) -> None:
@@ -155,7 +170,7 @@ def test_joined_takes_every_part_of_the_session() -> None:
 
 
 def test_single_frames() -> None:
-    choice = choose(embedded(np.tile(HISTORY, (4, 1)), Y), Rule("top32", 0.5))
+    choice = choose(embedded(np.tile(HISTORY, (4, 1)), Y), Rule("top"))
     # 20 frames of Y, then the first 12 of the 16 MIXED.
     expected = [i for i in range(60) if i % 15 in range(4, 9)]
     expected += [i for i in range(60) if i % 15 >= 11][:12]
@@ -172,7 +187,9 @@ def test_the_oracle_takes_the_first_part_wherever_it_lies(
     lessons: tuple[int, ...], span: tuple[int, int]
 ) -> None:
     measured = made(cuts={4: 0.1}, high={1: 1}, lessons=lessons)
-    assert choose(measured, Rule("oracle")).spans == (span,)
+    choice = choose(measured, Rule("oracle"))
+    assert choice.spans == (span,)
+    assert (choice.segments, choice.threshold) == ((), None)  # it does not cut
 
 
 def test_lots_are_those_of_the_rule() -> None:

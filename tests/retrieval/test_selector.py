@@ -9,7 +9,8 @@ from support.messages import raises
 
 from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError
-from robomme_interference_data.retrieval.select import choose, measure
+from robomme_interference_data.retrieval.measure import measure
+from robomme_interference_data.retrieval.select import choose
 from robomme_interference_data.retrieval.selector import Selector
 from robomme_interference_data.retrieval.stored_selector import StoredSelector
 
@@ -38,11 +39,11 @@ def test_what_identifies_a_selector(indexed: Path) -> None:
             "fingerprint": index.units.header.encoder.sha256,
             "camera": "front",
             "method": "max",
-            "threshold": "adaptive",
+            "number": "adaptive",
             "cosine": (1 + index.units.typical_cosine) / 2,
         }
     fixed = Selector("thumbnail", rule="mean/0.5").identity(buffer)
-    assert (fixed["method"], fixed["threshold"], fixed["cosine"]) == ("mean", 0.5, 0.5)
+    assert (fixed["method"], fixed["number"], fixed["cosine"]) == ("mean", 0.5, 0.5)
 
 
 def test_what_it_cannot_choose_from(indexed: Path, tiny_buffers: Path) -> None:

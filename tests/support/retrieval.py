@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
@@ -16,13 +15,8 @@ from robomme_interference_data.data.index_layout import IndexHeader
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.index import build_index
-from robomme_interference_data.retrieval.segment import (
-    FrameSpan,
-    adjacent_cosines,
-    closest_cosines,
-    cosines,
-)
-from robomme_interference_data.retrieval.select import Similarities
+from robomme_interference_data.retrieval.measure import Similarities
+from robomme_interference_data.retrieval.segment import FrameSpan, adjacent_cosines, cosines
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.manifest import layout_sessions
 from robomme_interference_data.storage.files import write_json
@@ -144,7 +138,7 @@ def made(
     names = [episode if n in lessons else next(others) for n in range(len(spans))]
     sessions: tuple[Session, ...] = sessions_of(names, spans, lessons)
     query = EpisodeId.parse(episode)
-    return Similarities(query, condition, sessions, adjacent, alike, 0.0, lambda span: alike)
+    return Similarities(query, condition, sessions, adjacent, alike, 0.0, lambda: np.eye(frames))
 
 
 def embedded(history: np.ndarray, query: np.ndarray, lesson: FrameSpan = (0, 0)) -> Similarities:
@@ -153,5 +147,7 @@ def embedded(history: np.ndarray, query: np.ndarray, lesson: FrameSpan = (0, 0))
     lessons = [spans.index(lesson)] if lesson in spans else []
     sessions = sessions_of(["MoveCube/test/0"] * len(spans), spans, lessons)
     episode, alike = EpisodeId.parse("MoveCube/test/0"), cosines(history, query)
-    near = partial(closest_cosines, history)
-    return Similarities(episode, "k2", sessions, adjacent_cosines(history), alike, 0.0, near)
+    rows = history.astype(np.float32)
+    return Similarities(
+        episode, "k2", sessions, adjacent_cosines(history), alike, 0.0, lambda: rows
+    )

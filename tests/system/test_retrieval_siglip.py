@@ -16,7 +16,7 @@ from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.data.embeddings import normalized, open_index
 from robomme_interference_data.errors import FormatError, HubError, InvalidOptionError
 from robomme_interference_data.retrieval.encoders import make_encoder
-from robomme_interference_data.retrieval.select import measure
+from robomme_interference_data.retrieval.measure import measure
 from robomme_interference_data.retrieval.selector import Selector
 
 

@@ -17,7 +17,8 @@ from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.constants import EXECUTIONS, MANIFESTS, STATE
 from robomme_interference_data.data.questions import read_questions
 from robomme_interference_data.errors import InvalidOptionError, MissingFileError, UnknownNameError
-from robomme_interference_data.retrieval.select import choose, measure
+from robomme_interference_data.retrieval.measure import measure
+from robomme_interference_data.retrieval.select import choose
 from robomme_interference_data.retrieval.selector import Selector
 from robomme_interference_data.schema.sampling import Memory
 from robomme_interference_data.schema.shifts import SHIFTS
