@@ -183,7 +183,7 @@ def make_datasets(config: TrainingConfig) -> tuple[HistoryDataset, Any]:
     if held_out == len(used):
         expected = f"less: of {len(used)} episodes, none is left to train on"
         raise InvalidOptionError.expected("--dataset.eval_split", data.eval_split, expected)
-    evaluation = make(used[-held_out:], None)
+    evaluation: Any = make(used[-held_out:], None)
     # LeRobot chooses them from its own table of items.
     chosen = spread(0, len(evaluation), config.max_eval_samples or len(evaluation))
     return make(used[:-held_out], transforms), _HeldOut(evaluation, chosen)
@@ -194,13 +194,13 @@ def _indices(buffer_set: BufferSet, split: str) -> list[int]:
     return sorted({one.index for one in buffer_set.episode_ids if one.split == split})
 
 
-class _HeldOut(Subset[dict[str, Any]]):
+class _HeldOut(Subset[Any]):
     """Items to evaluate on, the same ones under the same conditions each time.
 
     accelerate sets the epoch of a dataset that has one; this has none.
     """
 
-    dataset: HistoryDataset
+    dataset: Any  # a HistoryDataset
 
     def __getitems__(self, indices: list[int]) -> Any:
         """Return the items of a batch."""
