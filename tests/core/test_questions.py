@@ -54,7 +54,7 @@ def test_letters_and_chance() -> None:
         {"options": ("",) * 9, "answers": tuple(range(9))},
         {"answers": (4, 0)},
         {"answers": (4, 0, 4)},
-        {"answers": (4, 0, -1)},
+        {"answers": (4, 0, -2)},
         {"right": 3},
         {"points": ("", "")},
         {"points": ("1,2", "3", "")},

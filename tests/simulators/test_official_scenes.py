@@ -178,7 +178,7 @@ def test_a_scene_with_endless_answers_is_an_error(family: str, facts: dict[str, 
 def test_questions_about_official_lessons() -> None:
     def query(episode: EpisodeId) -> Any:
         one = RECORDED[str(episode)]
-        record = SimpleNamespace(scene=json.dumps(one["scene"]))
+        record = SimpleNamespace(scene=json.dumps(one["scene"]), ability=None)
         metadata = {"simulator": "robomme", "seed": 7, "difficulty": one["difficulty"]}
         return SimpleNamespace(episode_id=episode, record=record, **metadata)
 
