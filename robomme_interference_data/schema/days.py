@@ -9,14 +9,15 @@ Rule version 1, for day d of n tasks:
 1. *Queries.* With m = n // 15, at least 1, the episodes d·m to d·m + m − 1 of every family are
    candidates, family by family beginning with family d. They are taken while their lessons fit into
    three quarters of the first n − n // 4 tasks.
-2. *Abilities.* What a query asks for depends on its id alone: its family and index go through a
-   cycle of six (see `ability_of`).
+2. *Abilities.* What a query asks for depends on its id alone (see `ability_of`). In every family
+   and difficulty all abilities occur equally often, so that no first view tells which one it is.
 3. *Order.* The lessons are put at random places of the first n − n // 4 tasks; several lessons of a
    query are in the order that its ability needs. Other tasks fill the rest, so that every query can
-   be asked after up to n // 4 further tasks. Every fifth of them is idle time.
+   be asked after up to n // 4 further tasks. Every fifth of them is idle time. A query without a
+   lesson is asked where the last lesson of another one might be.
 4. *Other tasks* are episodes that no buffer set has by default, each family equally often.
-5. *Appearance.* Every third day has another light, other cameras or clutter until half of its tasks
-   are done; strength 2.
+5. *Appearance.* One of every three days has another light, other cameras or clutter, in turn, until
+   half of its tasks are done; strength 2.
 """
 
 import hashlib
@@ -24,7 +25,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
-from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.errors import InvalidIdError
 from robomme_interference_data.ids import EpisodeId
 
@@ -109,10 +110,12 @@ def day_tasks(day: EpisodeId) -> int:
 
 def ability_of(query: EpisodeId) -> str:
     """Return the ability that a query of a day needs: one of `ABILITIES`."""
-    cycle = _CYCLE_IN_PIECES if query.family in _IN_PIECES else _CYCLE
-    ability = cycle[(FAMILIES.index(query.family) + query.index) % len(cycle)]
+    cycle = _cycle(query)
+    # Difficulties alternate with the index: within each, the cycle goes on.
+    turn, difficulty = divmod(query.index, len(DIFFICULTIES))
+    ability = cycle[(FAMILIES.index(query.family) + turn + 2 * difficulty) % len(cycle)]
     if ability == "order":
-        return "order-last" if query.index // len(cycle) % 2 else "order-first"
+        return "order-last" if _lot(query, "order") % 2 else "order-first"
     return ability
 
 
@@ -156,9 +159,10 @@ def plan_day(
         lessons = _lessons(query, other_answer)
         own = sorted(places[len(tasks) : len(tasks) + len(lessons)])
         tasks |= dict(zip(own, lessons, strict=True))
-        asked = own[-1] if own else _lot(day, "asked", query) % early
+        asked = own[-1] if own else _asked_without(day, query)
         queries.append(DayQuery(query, asked))
-    fill = _fill(day, others)
+    asked_about = {query.episode for query in queries}
+    fill = _fill(day, (episode for episode in others if episode not in asked_about))
     for place in range(count):
         if place not in tasks:
             tasks[place] = next(fill)
@@ -174,6 +178,21 @@ def plan_day(
         ),
         tuple(sorted(queries, key=lambda query: query.episode)),
     )
+
+
+def _cycle(query: EpisodeId) -> tuple[str, ...]:
+    return _CYCLE_IN_PIECES if query.family in _IN_PIECES else _CYCLE
+
+
+def _asked_without(day: EpisodeId, query: EpisodeId) -> int:
+    """Return the task after which a query without a lesson is asked.
+
+    It is distributed as the last lesson of a query of its family that has one or two, so that the
+    length of the history does not tell that there is none.
+    """
+    others = [ability for ability in _cycle(query) if ability != "absent"]
+    lessons = 1 if others[_lot(day, "as", query) % len(others)] == "recall" else 2
+    return max(_lot(day, "asked", query, number) % _early(day) for number in range(lessons))
 
 
 def _early(day: EpisodeId) -> int:
@@ -222,13 +241,15 @@ def _fill(day: EpisodeId, others: Iterable[EpisodeId]) -> Iterator[tuple[Episode
 
 def _look(day: EpisodeId, place: int) -> str:
     """Return how the table looks during a task."""
-    third, turn = divmod(day.index, 3)
-    if turn != 2 or place >= day_tasks(day) // 2:
+    # Which of three days it is, is drawn: a fixed turn would go together with some abilities.
+    block, turn = divmod(day.index, 3)
+    drawn = _lot(EpisodeId(day.family, day.split, block), "look") % 3
+    if turn != drawn or place >= day_tasks(day) // 2:
         return NO_SHIFT
-    return str(Shift(KINDS[third % len(KINDS)], _STRENGTH))
+    return str(Shift(KINDS[block % len(KINDS)], _STRENGTH))
 
 
-def _lot(day: EpisodeId, *parts: object) -> int:
-    """Return a number that depends on the day and the parts alone."""
-    text = "/".join(map(str, (DAY_RULE_VERSION, day, *parts)))
+def _lot(episode: EpisodeId, *parts: object) -> int:
+    """Return a number that depends on a day or query, and the parts, alone."""
+    text = "/".join(map(str, (DAY_RULE_VERSION, episode, *parts)))
     return int.from_bytes(hashlib.sha256(text.encode()).digest())
