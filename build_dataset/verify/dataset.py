@@ -214,10 +214,12 @@ def _day(where: str, day: Day, length: int) -> Iterator[Violation]:
     for span in day.spans:
         if not all(span.start <= shown.start < shown.stop <= span.stop for shown in span.evidence):
             yield Violation(where, f"evidence of {span.source} is outside of its frames")
-    tasks = sum(span.part != "transition" for span in day.spans)
+    tasks = [span for span in day.spans if span.part != "transition"]
     for query in day.queries:
-        if query.task not in range(tasks):
-            yield Violation(where, f"{query.episode} is asked after task {query.task} of {tasks}")
+        own = [number for number, span in enumerate(tasks) if span.source.scene == query.episode]
+        if query.task not in range(max(own, default=0), len(tasks)):
+            what = f"{query.episode} is asked after task {query.task} of {len(tasks)}"
+            yield Violation(where, f"{what}; its lessons are {own}")
 
 
 def start_violations(

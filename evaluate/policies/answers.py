@@ -48,8 +48,8 @@ _ASK = "Give the folder of a run of questions (ask), or a CSV file of its rows."
 class ActOutAnswers(Privileged):
     """`answers`: the simulator's script carries out what a run of questions answered.
 
-    Without a choice it holds the first pose, as `noop` does, and if the answer is that nothing was
-    shown, which succeeds where that is right.
+    It holds the first pose, as `noop` does, if the answer is that nothing was shown, and without a
+    choice, which then never succeeds: see `chosen_answer`.
 
     Args:
         path: Folder of a run of questions, or a CSV file of its rows. Workers do not read it.
@@ -137,6 +137,8 @@ def read_answers(
 def chosen_answer(row: Rollout, question: Question) -> int | None:
     """Return the number of the answer that a row chose, or None if it is to do nothing.
 
+    Without a choice that is nothing, too, but a wrong answer in days, where nothing may be right.
+
     Raises:
         FormatError: The row does not answer this question.
     """
@@ -148,8 +150,14 @@ def chosen_answer(row: Rollout, question: Question) -> int | None:
             f"answer its question, whose options are {question.letters} and {right} is right",
             "Ask the questions of this buffer set again.",
         )
-    answer = NOT_SHOWN if letter is None else question.answers[question.letters.index(letter)]
-    return None if answer == NOT_SHOWN else answer
+    if letter is not None:
+        answer = question.answers[question.letters.index(letter)]
+        return None if answer == NOT_SHOWN else answer
+    if NOT_SHOWN not in question.answers:
+        return None
+    # To do nothing might be right, as no choice never is.
+    wrong = (n for at, n in enumerate(question.answers) if at != question.right and n != NOT_SHOWN)
+    return next(wrong)
 
 
 def _read_csv(path: Path) -> dict[WorkItem, Rollout]:

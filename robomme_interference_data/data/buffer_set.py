@@ -222,7 +222,8 @@ class BufferSet:
             if isinstance(self.files, LocalFiles) and self.is_own:
                 from .query_sessions import lacking_for
 
-                lacking = lacking_for(parsed, self.files.root, self.episode_ids)
+                queries = map(self.query, self.episode_ids)
+                lacking = lacking_for(parsed, self.files.root, queries)
             if lacking is None:
                 raise UnknownNameError(what, there, self.planning(parsed.name))
             raise UnknownNameError(what, f"{there} {lacking}")

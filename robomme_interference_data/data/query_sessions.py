@@ -24,7 +24,7 @@ from robomme_interference_data.errors import (
 )
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import Condition, parse_condition
-from robomme_interference_data.schema.draw import UnitPool, check_units, no_lesson
+from robomme_interference_data.schema.draw import UnitPool, check_units, only_in_days
 from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry, layout_sessions
 from robomme_interference_data.schema.records import Day, DayQuery, DaySpan, EpisodeRecord
 from robomme_interference_data.schema.sampling import lesson_frames, lesson_share
@@ -131,6 +131,12 @@ class SessionSource:
                 where = self.datasets[DAYS].files.describe()
                 raise FormatError.damaged(where, f"{record.episode_id}: no tasks")
             for query in record.day.queries:
+                if query.episode in found:
+                    days = f"{found[query.episode][0].episode_id} and {record.episode_id}"
+                    raise SourceError(
+                        f"{query.episode} is a query of two days, {days}",
+                        "Build days of different lengths into separate buffer sets.",
+                    )
                 found[query.episode] = record, record.day, query
         return found
 
@@ -165,7 +171,7 @@ class QuerySessions:
         """Return the lesson, or a part of it."""
         record = self._record
         if record.ability == "absent":
-            raise no_lesson(record.episode_id)
+            raise only_in_days(record.episode_id)
         whole = self._source.session(DEMONSTRATIONS, record.episode_id)
         if part == "lesson":
             return whole
@@ -191,6 +197,8 @@ class QuerySessions:
 
     def contradiction(self) -> SessionEntry:
         """Return the lesson in the query's scene with another answer."""
+        if self._record.ability is not None:
+            raise only_in_days(self._record.episode_id)
         return self._source.session(CONTRADICTIONS, self._record.episode_id)
 
     def day(self, k: int) -> Sequence[SessionEntry]:
@@ -276,21 +284,24 @@ def buffer_manifest(
     )
 
 
-def lacking_for(condition: Condition, root: Path, queries: Iterable[EpisodeId]) -> str | None:
+def lacking_for(condition: Condition, root: Path, queries: Iterable[Query]) -> str | None:
     """Return what the folder of a buffer set lacks for buffers under a condition; None if nothing.
 
     Args:
         condition: The condition.
         root: The folder.
-        queries: The query episodes.
+        queries: The queries.
     """
     names = [name for name in condition.kind.needs if not (root / name).is_dir()]
     if names:
         return f"For {condition}, build the {' and '.join(names)} first."
     # Without the check of its revision: the next plan draws from the units that are there now.
     units = Dataset(LocalFiles(root / DISTRACTORS)).records()
+    abilities = {query.episode_id: query.record.ability for query in queries}
+    absent = {episode for episode, ability in abilities.items() if ability == "absent"}
     try:
-        check_units(UnitPool(unit.episode_id for unit in units), queries, [condition])
+        pool = UnitPool(unit.episode_id for unit in units)
+        check_units(pool, abilities, [condition], absent)
     except BuildError as error:
         return f"For {condition}, {error.message}."
     return None

@@ -159,10 +159,13 @@ def check_units(
             condition.sessions(_UnreadSessions(query, pool, query in absent))
 
 
-def no_lesson(query: EpisodeId) -> BuildError:
-    """Return the error about a condition that needs the lesson of a query without one."""
+def only_in_days(query: EpisodeId) -> BuildError:
+    """Return the error about a condition that needs a lesson which the query's day does not show.
+
+    A day may show none, or the goal may ask for the first of two.
+    """
     return BuildError(
-        f"{query} has no lesson: its day never shows it, to ask whether a memory knows that",
+        f"{query} is a query of a day, which decides on its lessons",
         f"Choose {named('conditions')} of days alone: no-history,day-alone,day-k0,day-k3",
     )
 
@@ -177,7 +180,7 @@ class _UnreadSessions:
 
     def lesson(self, part: str = "lesson") -> Any:
         if self.absent:
-            raise no_lesson(self.query)
+            raise only_in_days(self.query)
         return self.query
 
     def contradiction(self) -> Any:

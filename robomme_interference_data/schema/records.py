@@ -123,7 +123,7 @@ class EpisodeRecord:
     ] = None
     ability: Annotated[
         str | None,
-        "What a query of a day needs of a memory: one of `days.ABILITIES`; None for others.",
+        "What a query of a day needs of a memory: one of `constants.ABILITIES`; None for others.",
     ] = None
     day: Annotated[Day | None, "The tasks and queries of a day; None for other episodes."] = None
 

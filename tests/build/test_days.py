@@ -34,7 +34,7 @@ from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.schema.records import DaySpan
 
 RECORDS = "days/meta/interference.parquet"
-UPDATE, PIECES, ABSENT = "VideoRepick/test/7", "RouteStick/test/8", "RouteStick/test/7"
+UPDATE, PIECES, ABSENT = "VideoUnmask/test/1", "RouteStick/test/6", "VideoPlaceOrder/test/1"
 QUIET = WorkProgress(quiet=True)
 
 
@@ -65,7 +65,7 @@ def frames_of(span: DaySpan) -> Any:
 
 def test_spans_are_the_day_frame_by_frame(root: Path) -> None:
     held = dataset(root, "days")
-    assert [str(record.episode_id) for record in held.records()] == ["Day8/test/7", "Day8/test/8"]
+    assert [str(record.episode_id) for record in held.records()] == ["Day8/test/1", "Day8/test/6"]
     for record in held.records():
         assert record.day is not None
         frames = np.stack([*held.iter_frames(record.episode_index, "front", 0, record.length)])
@@ -93,12 +93,13 @@ def test_queries_have_their_abilities(root: Path) -> None:
         for record in dataset(root, "demonstrations").records()
     }
     assert abilities == {
-        "VideoRepick/test/7": "update",
-        "VideoRepick/test/8": "order-last",
-        "VideoPlaceOrder/test/8": "absent",
-        "PatternLock/test/7": "several",
-        "RouteStick/test/7": "absent",
-        "RouteStick/test/8": "several",
+        "VideoPlaceOrder/test/1": "absent",
+        "VideoPlaceButton/test/1": "recall",
+        "VideoUnmask/test/1": "update",
+        "VideoUnmaskSwap/test/1": "recall",
+        "InsertPeg/test/6": "order-first",
+        "PatternLock/test/6": "absent",
+        "RouteStick/test/6": "several",
     }
     for name in ("days", "distractors"):
         assert {record.ability for record in dataset(root, name).records()} == {None}
@@ -129,8 +130,8 @@ def test_buffers_are_spans_of_the_day(root: Path) -> None:
         for manifest in load_buffer_set(root).manifests()
     }
     assert [role for role, *_ in sessions[UPDATE, "day-k2"]][1::2] == [
-        "distractor",
         "contradiction",
+        "distractor",
         "lesson",
         "distractor",
         "distractor",
@@ -149,7 +150,7 @@ def test_buffers_are_spans_of_the_day(root: Path) -> None:
         assert [entry[0] for entry in long[::2]] == ["transition"] * (len(long) // 2)
         # Without a border: every session begins where the last one ends.
         assert [entry[2] for entry in long] == [0, *(entry[3] for entry in long[:-1])]
-        assert (alone == []) == (query in (ABSENT, "VideoPlaceOrder/test/8"))
+        assert (alone == []) == (query in (ABSENT, "PatternLock/test/6"))
         assert sessions[query, "no-history"] == []
     assert [entry[:2] for entry in sessions[PIECES, "day-alone"]] == [("lesson", PIECES)] * 2
 
@@ -180,7 +181,7 @@ def test_its_card_counts_the_days(root: Path) -> None:
 def test_no_lesson_without_one_before_anything_is_built(tmp_path: Path, run: Any) -> None:
     out = tmp_path / "buffers"
     code, _, err = run(
-        *("build", out, "--source", "tabletop-day:8", "--split", "test", "--episodes", "7"),
+        *("build", out, "--source", "tabletop-day:8", "--split", "test", "--episodes", "1"),
         *("--unit-episodes", "0", "--conditions", "k0,day-k0"),
     )
     assert code == 1 and ABSENT in err and "day-k0" in err
@@ -192,7 +193,7 @@ def test_no_lesson_without_one_before_anything_is_built(tmp_path: Path, run: Any
     [
         (("k0",), None, BuildError),  # one of the queries has no lesson
         (("day-k63",), None, BuildError),
-        (("day-k2",), 1400, InvalidOptionError),  # of 229 frames and 1300 steps
+        (("day-k2",), 1400, InvalidOptionError),  # of 169 frames and 1300 steps
     ],
 )
 def test_what_days_do_not_hold_is_not_planned(
@@ -207,7 +208,7 @@ def test_what_days_do_not_hold_is_not_planned(
 def test_days_that_lack_a_query(own: Path) -> None:
     shutil.rmtree(own / "days")
     with playing_days():
-        build_dataset(plan_of("days", (7,)), own / "days", Serial(), QUIET)
+        build_dataset(plan_of("days", (6,)), own / "days", Serial(), QUIET)
     with raises(SourceError):
         plan_again(own, CONDITIONS)
 
@@ -257,11 +258,11 @@ def too_late(day: dict[str, Any]) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("change", "pattern"),
     [
-        (earlier, "days Day8/test/7: its spans are not its"),
-        (exchanged, "days Day8/test/7: frames 0 to [0-9]+ do not have the recorded SHA-256"),
-        (outside, "days Day8/test/7: evidence of .* is outside of its frames"),
-        (too_late, "days Day8/test/7: VideoRepick/test/7 is asked after task 8 of 8"),
-        (lambda day: None, "days Day8/test/7: has no tasks"),
+        (earlier, "days Day8/test/1: its spans are not its"),
+        (exchanged, "days Day8/test/1: frames 0 to [0-9]+ do not have the recorded SHA-256"),
+        (outside, "days Day8/test/1: evidence of .* is outside of its frames"),
+        (too_late, "days Day8/test/1: VideoPlaceOrder/test/1 is asked after task 8 of 8"),
+        (lambda day: None, "days Day8/test/1: has no tasks"),
     ],
 )
 def test_a_changed_day_is_found(own: Path, change: Any, pattern: str) -> None:
@@ -309,7 +310,7 @@ def test_a_build_that_was_stopped_gives_the_same_bytes(
             build_dataset(plan, tmp_path / "days", Serial(), QUIET)
         assert not (tmp_path / "days").exists()
         build_dataset(plan, tmp_path / "days", Serial(), QUIET)
-    assert played == ["Day8/test/8", "Day8/test/7", "Day8/test/7"]
+    assert played == ["Day8/test/6", "Day8/test/1", "Day8/test/1"]
     assert contents(tmp_path / "days") == contents(root / "days")
 
 
@@ -330,5 +331,5 @@ def test_of_published_days_only_the_one_that_is_loaded_is_downloaded(
     videos = [path for path in hub.downloads() if path.endswith(".mp4")]
     assert sorted(videos) == [  # the second day, and the first live observation
         "days/videos/observation.images.front/chunk-000/file-001.mp4",
-        "videos/observation.images.front/chunk-000/file-005.mp4",
+        "videos/observation.images.front/chunk-000/file-006.mp4",
     ]

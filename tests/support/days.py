@@ -35,7 +35,7 @@ from robomme_interference_data.simulators.episode import (
 )
 
 DATASETS = ("demonstrations", "distractors", "days")
-NUMBERS = (7, 8)
+NUMBERS = (1, 6)
 """Of the days: one of them looks different at first, and shows a lesson in pieces."""
 
 CONDITIONS = ("no-history", "day-k0", "day-k2", "day-cut-k0", "day-cut-k2", "day-alone")

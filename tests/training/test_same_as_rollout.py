@@ -137,8 +137,8 @@ def test_same_frames_states_and_positions(
 
 
 def test_of_days(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    root, query = tmp_path / "buffers", EpisodeId("VideoRepick", "test", 7)
-    build_days(root, "executions", numbers=(7,), cameras=CAMERAS)
+    root, query = tmp_path / "buffers", EpisodeId("VideoUnmask", "test", 1)
+    build_days(root, "executions", numbers=(1,), cameras=CAMERAS)
     make_index(root, names=DATASETS)
     for condition, memory, retrieval in (
         ("day-k0", "framesamp:8", None),

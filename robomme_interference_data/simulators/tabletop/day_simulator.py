@@ -17,13 +17,16 @@ from robomme_interference_data.simulators.episode import CAMERAS, EpisodeStart, 
 from .day import TABLE, PlayedDay
 from .simulator import TabletopSimulator
 
+_STILL = 0.02  # m
+
 
 class TabletopDaySimulator(TabletopSimulator):
     """The episodes of `tabletop` as queries of a day; see `schema/days.py`.
 
     All families have the same table, and the goal says which lesson counts if the order matters.
     In an episode whose ability is `absent`, nothing was shown: an attempt that the family's judge
-    decides on, either way, fails, and holding still until the step limit succeeds. There,
+    decides on, either way, fails. What succeeds is to hold still: at the step limit, the arm's tip
+    and all things must be within 2 cm of where they were. There,
     `oracle` holds still. In every episode, `recall` holds still if it knows no part of the answer:
     a memory that keeps the whole day then knows that nothing was shown.
 
@@ -72,7 +75,12 @@ class TabletopDaySimulator(TabletopSimulator):
     def _begin(self, episode: EpisodeId, frame_step: int) -> EpisodeStart:
         lesson, first, info = super()._begin(episode, frame_step)
         goals = tuple(goal_in_day(episode, goal) for goal in info.goals)
+        self._start = self._positions()
         return lesson, first, replace(info, goals=goals)
+
+    def _positions(self) -> NDArray[np.float64]:
+        """Return where the arm's tip and all things are, `(n, 3) float64`, in m."""
+        return np.stack([self.env.arm.tip, *(thing.p for thing in self.env.builder.things)])
 
     def _act(
         self, policy: str, known: Mapping[int, str], answer: int | None
@@ -90,8 +98,10 @@ class TabletopDaySimulator(TabletopSimulator):
             return observation, status
         if status is not Status.ONGOING:
             return observation, Status.FAIL
-        held = self._steps == MAX_STEPS
-        return observation, Status.SUCCESS if held else Status.ONGOING
+        if self._steps < MAX_STEPS:
+            return observation, Status.ONGOING
+        moved = np.linalg.norm(self._positions() - self._start, axis=1).max()
+        return observation, Status.SUCCESS if moved < _STILL else Status.FAIL
 
 
 def _absent(episode: EpisodeId) -> bool:
