@@ -125,7 +125,7 @@ class SessionSource:
 
     @cached_property
     def _days(self) -> dict[EpisodeId, tuple[EpisodeRecord, Day, DayQuery]]:
-        found = {}
+        found: dict[EpisodeId, tuple[EpisodeRecord, Day, DayQuery]] = {}
         for record in self.datasets[DAYS].records():
             if record.day is None:
                 where = self.datasets[DAYS].files.describe()

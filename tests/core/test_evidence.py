@@ -166,6 +166,14 @@ def test_known_are_the_parts_of_which_a_frame_is_kept() -> None:
     assert known_parts(evidence, [9]) == {1: "from the left", 0: "takes peg 2"}
 
 
+def test_of_two_lessons_the_last_counts_unless_the_goal_asks_for_the_first() -> None:
+    other = replace(FIRST, text="takes peg 1")
+    sessions = layout_sessions([replace(ENTRY, dataset="other"), ENTRY])
+    found = map_evidence(sessions, lambda entry: [other if entry.dataset == "other" else FIRST])
+    assert known_parts(found or (), range(60)) == {0: FIRST.text}
+    assert known_parts(found or (), range(60), first_counts=True) == {0: "takes peg 1"}
+
+
 def test_a_part_may_need_several_frames() -> None:
     evidence = placed(replace(ENTRY, stop=9), replace(ENTRY, start=9))  # one span in two halves
     first = [

@@ -13,7 +13,7 @@ from support.messages import raises
 from support.runs import header
 from support.tabletop import TABLETOP, copy_tabletop
 
-from robomme_interference_data.data.questions import read_questions
+from robomme_interference_data.data.questions import NOT_SHOWN, read_questions
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate import RunConfig, RunResult, run_evaluation
 from robomme_interference_data.evaluate.policies.answers import chosen_answer
@@ -195,6 +195,15 @@ def test_the_answer_that_a_row_chose(right: Path) -> None:
     index = (question.right + 1) % len(question.letters)
     assert chosen_answer(wrong, question) == question.answers[index]
     assert chosen_answer(replace(wrong, answer=None), question) is None
+    in_day = replace(
+        question,
+        options=(*question.options, "it was not shown"),
+        answers=(*question.answers, NOT_SHOWN),
+        points=(*question.points, ""),
+    )
+    assert chosen_answer(replace(wrong, answer=in_day.letters[-1]), in_day) is None
+    no_choice = chosen_answer(replace(wrong, answer=None), in_day)
+    assert no_choice in {*question.answers} - {question.answers[question.right]}
     for other in (replace(row, answer=wrong_letter()), replace(wrong, answer="H")):
         if "H" not in question.letters or other.answer != "H":
             with raises(InterferenceError):

@@ -74,6 +74,7 @@ def made_up(
         evidence=np.full(status.shape, np.nan),
         action_l1=np.full(status.shape, np.nan),
         difficulty=np.zeros(len(EPISODES), int),
+        ability=np.full(len(EPISODES), -1),
         chance=np.full(len(EPISODES), np.nan),
         expected=np.ones(len(EPISODES), bool),
         in_tables=np.ones((systems, len(conditions)), bool),

@@ -20,6 +20,7 @@ NO_ROWS = {
     "robomme/ceilings.csv",
     "robomme/lessons.parquet",
     "robomme/shortcuts.csv",
+    "tabletop/encoders.csv",
     "training/rates.csv",
 }
 FILES = [

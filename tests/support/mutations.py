@@ -51,7 +51,7 @@ def mutate(path: Path, place: Place) -> None:
     number, field = table.column_names.index(name), table.schema.field(name)
     values = table[name].to_pylist()
     if values[row] is None and pa.types.is_struct(field.type):  # it is written whole or not at all
-        values = [dict.fromkeys((one.name for one in field.type), "x")] * len(values)
+        values = [{one.name: _changed(None, (), one.type) for one in field.type}] * len(values)
     else:
         values[row] = _changed(values[row], tuple(rest), field.type)
     pq.write_table(table.set_column(number, field, pa.array(values, field.type)), path)
