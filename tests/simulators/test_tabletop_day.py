@@ -274,7 +274,7 @@ def test_the_goal_says_which_lesson_counts_if_the_order_matters(
 ) -> None:
     goals = [blind.reset(episode, demonstration=False)[2].goal for episode in (PRESENT, ORDER)]
     assert not goals[0].endswith("time")
-    assert goals[1].endswith(", as it was shown the first time")
+    assert goals[1].endswith(", as it was shown the last time")
 
 
 def test_it_records_the_versions_of_both() -> None:
