@@ -120,6 +120,10 @@ def _mean(values: NDArray[np.float32]) -> float:
     return float(np.round(values.mean(dtype=np.float64), 6))
 
 
+def _best(measured: Similarities, parts: Parts) -> list[FrameSpan]:
+    return [parts.best(parts.segments)]
+
+
 def _joined(measured: Similarities, parts: Parts) -> list[FrameSpan]:
     """Return the best segment, and all segments with a similar frame."""
     first = parts.best(parts.segments)
@@ -157,7 +161,7 @@ def _oracle(measured: Similarities, parts: Parts) -> list[FrameSpan]:
 METHODS = {
     "max": Method(
         "the segment with the frame closest to the first live observation (released rule)",
-        lambda measured, parts: [parts.best(parts.segments)],
+        _best,
         sides=1,
         score=_highest,
     ),
@@ -175,14 +179,14 @@ METHODS = {
     ),
     "mean": Method(
         "the segment with the highest mean cosine with the first live observation",
-        lambda measured, parts: [parts.best(parts.segments)],
+        _best,
         sides=1,
         score=_mean,
     ),
     "changes": Method(
         f"as max, of segments cut where the means of {_CHANGE_FRAMES} frames before and after "
         "differ most (ours)",
-        lambda measured, parts: [parts.best(parts.segments)],
+        _best,
         sides=_CHANGE_FRAMES,
         score=_highest,
     ),

@@ -27,12 +27,7 @@ from robomme_interference_data.simulators.tabletop.simulator import TabletopSimu
 
 UNMASK, LOCK = "VideoUnmask/test/0", "PatternLock/test/0"
 ABSENT, PRESENT, ORDER = UNMASK, "VideoUnmask/test/1", "VideoUnmask/test/5"
-PIECES = (
-    "VideoPlaceOrder/test/0",
-    "VideoPlaceButton/test/0",
-    "PatternLock/test/2",
-    "RouteStick/test/0",
-)
+PIECES = "PatternLock/test/2", "RouteStick/test/0"
 
 TASKS = (
     (UNMASK, "lesson", "none", 10),
@@ -213,19 +208,16 @@ def test_pieces_of_all_families_show_every_part(blind: TabletopDaySimulator, epi
         {seen.part: seen.text for seen in day.spans[number].evidence} for number in (1, 3)
     )
     assert first | second == {seen.part: seen.text for seen in lesson.evidence or ()}
-    assert set(second) - set(first)
-    # In VideoPlaceButton, the cube still rests where it was before the button was pressed.
-    assert set(first) - set(second) or episode.startswith("VideoPlaceButton")
+    assert set(second) - set(first) and set(first) - set(second)
     assert max(np.abs(after - before).max() for before, after in pairwise(day.states)) < 0.2
 
 
 def test_a_demonstration_is_cut_between_two_parts() -> None:
-    """Parts 1 and 2 begin in frames 3 and 8 of 10; the arm holds something in 2, 3 and 8."""
+    """Parts 1 and 2 begin in frames 3 and 8."""
     shown = [(), (0,), (0,), (0, 1), (1,), (1,), (1,), (1,), (1, 2), (2,)]
-    free = [frame not in (2, 3, 8) for frame in range(10)]
-    assert cut_of(shown, free) == 7  # 7 is nearer to the middle, 5, than 1
-    assert cut_of(shown[:8], free[:8]) == 1
-    assert cut_of(shown, [True] * 10) == 3  # of 3 and 8
+    assert cut_of(shown) == 3  # nearer to the middle, 5, than 8
+    assert cut_of(shown[:8]) == 3
+    assert cut_of([(0,), *shown[1:], *[(2,)] * 4]) == 8  # the middle is 7
 
 
 # --- queries ----------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from .bodies import Body, Color, SceneBuilder
 from .episodes import difficulty_of, seed_of
 from .families import draw_episode
 from .family import Family, Layout
-from .motion import HELD, Arm, Script, eased
+from .motion import Arm, Script, eased
 
 if TYPE_CHECKING:
     from .env import TabletopEnv
@@ -42,7 +42,6 @@ IDLE = 32
 
 _AWAY = 1.0  # m: whatever slides as far is out of both cameras' view
 _INSIDE = -0.045  # m: length of a stick that is hidden in the hand
-_CLEAR = 0.10  # m: an open gripper at this height holds and touches nothing
 
 _Shown = tuple[Observation, NDArray[np.float32], tuple[int, ...]]
 """A frame, and the parts of the answer that it shows."""
@@ -265,14 +264,8 @@ class PlayedDay:
 
     def _find_cut(self, episode: EpisodeId) -> int:
         """Return how many frames of a demonstration are its first piece."""
-        env = self._env
         _, script = self._demonstrate(episode)
-        shown, free = [], []
-        for _ in env.execute(script):
-            shown.append(env.layout.showing)
-            high = env.arm.opening > HELD and env.arm.tip[2] > _CLEAR
-            free.append(bool(env.layout.stick) or bool(high))
-        return cut_of(shown, free)
+        return cut_of([self._env.layout.showing for _ in self._env.execute(script)])
 
     def _standing(self) -> Standing:
         """Return how everything stands now."""
@@ -282,20 +275,19 @@ class PlayedDay:
         return Standing(env.layout, poses, qpos)
 
 
-def cut_of(shown: Sequence[Sequence[int]], free: Sequence[bool]) -> int:
+def cut_of(shown: Sequence[Sequence[int]]) -> int:
     """Return where a demonstration is cut into two pieces: the frames of the first one.
 
-    It is cut between two parts of the answer, at the last frame before a further part is shown at
-    which the arm holds nothing. Of these, it is the frame nearest to the middle.
+    It is cut before a frame with a further part of the answer, as near to the middle as possible.
+    Nothing is held there: the plan has pieces only of families whose arm moves a stick.
 
     Args:
         shown: The parts that each frame shows.
-        free: Whether the arm holds nothing in that frame.
     """
     seen: set[int] = set()
     cuts = []
     for frame, parts in enumerate(shown):
         if seen and not seen.issuperset(parts):
-            cuts.append(max(n for n in range(frame + 1) if free[n]))
+            cuts.append(frame)
         seen.update(parts)
     return min(cuts, key=lambda cut: abs(2 * cut - len(shown)))
