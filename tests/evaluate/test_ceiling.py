@@ -144,6 +144,17 @@ def test_a_wrong_lesson_leaves_no_chance() -> None:
     assert chance(asked, dict(enumerate(wrong))) == 0
 
 
+def test_in_a_day_nothing_known_is_nothing_done() -> None:
+    asked, parts = query("MoveCube", 0, 1)
+
+    def of_day(ability: str, known: dict[int, str]) -> float | None:
+        return chance(replace(asked, record=replace(asked.record, ability=ability)), known)
+
+    everything = dict(enumerate(parts))
+    assert (of_day("recall", {}), of_day("recall", everything)) == (0, 1)
+    assert (of_day("absent", {}), of_day("absent", everything)) == (1, 0)
+
+
 @pytest.mark.parametrize("unknown", ["simulator", "seed", "difficulty", "evidence"])
 def test_no_chance_where_answers_are_unknown(unknown: str) -> None:
     asked, _ = query("MoveCube", 0, 0)
