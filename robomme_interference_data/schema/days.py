@@ -16,8 +16,8 @@ Rule version 1, for day d of n tasks:
    be asked after up to n // 4 further tasks. Every fifth of them is idle time. A query without a
    lesson is asked where the last lesson of another one might be.
 4. *Other tasks* are episodes that no buffer set has by default, each family equally often.
-5. *Appearance.* One of every three days has another light, other cameras or clutter, in turn, until
-   half of its tasks are done; strength 2.
+5. *Appearance.* One of every three days looks different until half of its tasks are done: other
+   light, other cameras, clutter or other colors, in turn, of strength 2.
 """
 
 import hashlib

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 from robomme_interference_data.errors import InvalidOptionError
 
-KINDS = ("light", "camera", "clutter")
-"""Changes of: color and brightness of the lamps; camera poses; unused objects nearby."""
+KINDS = ("light", "camera", "clutter", "colors")
+"""Changes of: color and brightness of the lamps; camera poses; unused objects nearby; colors of
+the table and of objects that no goal names by color."""
 
 STRENGTHS = (1, 2, 3)
 """From weak to strong."""
@@ -15,8 +16,8 @@ NO_SHIFT = "none"
 """No shift: the live scene looks like the lesson's."""
 
 SHIFT_HELP = (
-    "none, or how the live scene differs from the lesson's (tabletop): light, camera or clutter "
-    "and a strength from 1 to 3, such as light:2."
+    "none, or how the live scene differs from the lesson's (tabletop): light, camera, clutter or "
+    "colors, and a strength from 1 to 3, such as light:2."
 )
 """Help of the option of every command."""
 

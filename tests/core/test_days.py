@@ -156,7 +156,7 @@ def test_the_goal_says_which_lesson_counts_if_the_order_matters() -> None:
 
 def test_one_of_three_days_looks_different_until_half_of_it_is_done() -> None:
     shifts = [[task.shift for task in plan(9, index).tasks] for index in range(12)]
-    for block, kind in enumerate(("light", "camera", "clutter", "light")):
+    for block, kind in enumerate(("light", "camera", "clutter", "colors")):
         different = [day for day in shifts[3 * block : 3 * block + 3] if day != ["none"] * 9]
         assert different == [[f"{kind}:2"] * 4 + ["none"] * 5]
 

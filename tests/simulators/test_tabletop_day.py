@@ -127,6 +127,15 @@ def test_a_task_equals_its_demonstration_bit_for_bit(
         ]
 
 
+def test_a_look_comes_gradually_while_the_objects_do(played: Played) -> None:
+    transition = played.spans[6]
+    corner = played.images["front"][transition.start - 1 : transition.stop + 1, 0, 0].astype(int)
+    changes = np.diff(corner.sum(axis=1))
+    assert abs(changes.sum()) > 30
+    assert np.all(changes * np.sign(changes.sum()) >= 0)
+    assert abs(changes).max() < 0.4 * abs(changes.sum())
+
+
 def test_nothing_jumps(simulator: TabletopDaySimulator, played: Played) -> None:
     """Where a transition is slow, the two frames at each of its ends are the same picture."""
     slow = 150

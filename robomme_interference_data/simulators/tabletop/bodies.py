@@ -93,6 +93,14 @@ class Body:
     def pose(self, pose: "sapien.Pose") -> None:
         self._entity.set_pose(pose)
 
+    @property
+    def materials(self) -> "list[sapien.render.RenderMaterial]":
+        """The materials of its surfaces."""
+        import sapien
+
+        drawn = self._entity.find_component_by_type(sapien.render.RenderBodyComponent)
+        return [shape.material for shape in drawn.render_shapes]
+
     def point(self, x: float, y: float, z: float) -> NDArray[np.float64]:
         """Convert a point from the body's own axes to the table's, `(3,) float64`."""
         import sapien

@@ -15,6 +15,9 @@ whole arm except the top of its shoulder."""
 FRONT_TARGET = (-0.30, 0.0, 0.21)
 """The point that it faces, in m."""
 
+AWAY = 1.0
+"""Whatever slides as far to a side, in m, is out of both cameras' view."""
+
 FRONT_VIEW = math.radians(46)
 SIZE = 256
 """Pixels of its image, vertically and horizontally."""

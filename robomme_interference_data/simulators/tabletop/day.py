@@ -19,10 +19,11 @@ from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.days import DayPlan, PlannedTask
 from robomme_interference_data.schema.evidence import spans_of_parts
 from robomme_interference_data.schema.records import DaySpan
-from robomme_interference_data.schema.shifts import parse_shift
+from robomme_interference_data.schema.shifts import NO_SHIFT, parse_shift
 from robomme_interference_data.simulators.episode import Observation
 
 from .bodies import Body, Color, SceneBuilder
+from .camera import AWAY
 from .episodes import difficulty_of, seed_of
 from .families import draw_episode
 from .family import Family, Layout
@@ -40,7 +41,6 @@ TABLE: Color = (0.58, 0.56, 0.50)
 IDLE = 32
 """Frames of idle time."""
 
-_AWAY = 1.0  # m: whatever slides as far is out of both cameras' view
 _INSIDE = -0.045  # m: length of a stick that is hidden in the hand
 
 _Shown = tuple[Observation, NDArray[np.float32], tuple[int, ...]]
@@ -129,7 +129,7 @@ class Transition(EmptyTable):
 
         for (bodies, poses), y in zip(self._groups, (part, part - 1), strict=True):
             for body, pose in zip(bodies, poses, strict=True):
-                body.pose = sapien.Pose(pose.p + np.array([0, y * _AWAY, 0], np.float32), pose.q)
+                body.pose = sapien.Pose(pose.p + np.array([0, y * AWAY, 0], np.float32), pose.q)
         self._robot.set_qpos(self.qpos(part).astype(np.float32))
         if self._stick is not None:
             old, new = (stick or _INSIDE for stick in self._sticks)
@@ -179,17 +179,18 @@ class PlayedDay:
     def _frames(self) -> Iterator[TimeStep]:
         self._env.load(EmptyTable())
         standing = self._standing()
+        look = self._plan.tasks[0].shift
         for task in self._plan.tasks:
             # The scene is built once to see how it begins, and once more to be played.
             next(self._begin(task)[1])
             way = Transition(standing, self._standing())
-            transition = self._travel(way, task)
+            transition = self._travel(way, task, look)
             yield from self._span(self._plan.day, "transition", task.shift, transition)
             parts, script = self._begin(task)
             source = task.episode or self._plan.day
             played = self._play(script, task)
             yield from self._span(source, task.part, task.shift, played, parts)
-            standing = self._standing()
+            standing, look = self._standing(), task.shift
 
     def _span(
         self,
@@ -212,24 +213,25 @@ class PlayedDay:
         stop = start + len(shown)
         self.spans.append(DaySpan(source, part, shift, start, stop, "", tuple(evidence)))
 
-    def _travel(self, way: Transition, task: PlannedTask) -> Iterator[_Shown]:
-        """Yield the frames of a transition."""
+    def _travel(self, way: Transition, task: PlannedTask, look: str) -> Iterator[_Shown]:
+        """Yield the frames of a transition; `look` is how the table looked before."""
         self._env.load(way)
         way.add_stick(self._env)
-        self._show(task)
         count = task.transition + 1
+        # A day has one shift at most: it comes or goes on the way.
+        shift = parse_shift(task.shift) or parse_shift(look)
+        old, new = (float(name != NO_SHIFT) for name in (look, task.shift))
         for step in range(1, count):
-            way.move(eased(step / count))
+            part = eased(step / count)
+            way.move(part)
+            self._env.show(shift, self._look, old + part * (new - old))
             yield self._env.observe(self._cameras), way.action(eased((step + 1) / count)), ()
 
     def _play(self, script: Script, task: PlannedTask) -> Iterator[_Shown]:
         """Yield the frames of a task."""
-        self._show(task)
+        self._env.show(parse_shift(task.shift), self._look)
         for action in self._env.execute(script):
             yield self._env.observe(self._cameras), action, self._env.layout.showing
-
-    def _show(self, task: PlannedTask) -> None:
-        self._env.show(parse_shift(task.shift), self._look)
 
     def _begin(self, task: PlannedTask) -> tuple[tuple[str, ...], Script]:
         """Load the scene of a task; return the texts of its answer's parts, and its script."""

@@ -233,8 +233,8 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
                 images[name] = np.ascontiguousarray(camera.get_picture("Color")[..., :3])
         return Observation(images, self.arm.state)
 
-    def show(self, shift: Shift | None, seed: int | None = None) -> None:
-        """Apply a shift from now on; None for no shift.
+    def show(self, shift: Shift | None, seed: int | None = None, part: float = 1.0) -> None:
+        """Apply a shift, or a part of it, from now on; None for no shift.
 
         `seed` is that of a new scene's shifts, by default the episode's.
         """
@@ -246,8 +246,9 @@ class TabletopEnv(BaseEnv):  # type: ignore[misc]
 
             cameras = {name: self._camera(name) for name in CAMERAS}
             seed = self.number if seed is None else seed
-            self._scene_shift = SceneShift(self.scene.sub_scenes[0], cameras, seed)
-        self._scene_shift.show(shift)
+            scene, bodies = self.scene.sub_scenes[0], self.builder.bodies
+            self._scene_shift = SceneShift(scene, cameras, bodies, seed)
+        self._scene_shift.show(shift, part)
 
     def render_rgb_array(self, camera_name: str | None = None) -> torch.Tensor:
         """Return a camera's image, front by default, `(1, 256, 256, 3) uint8` RGB."""
