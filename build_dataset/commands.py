@@ -50,9 +50,9 @@ def build(
     Parts: `distractors` have 32 frames per episode, raw indices 0, 8, …, 248; `distractors-raw`
     the first 249 to 256 raw frames, for `raw-k<n>`; `contradictions` the same scenes with
     another answer, for `stale-k<n>` and `misled-k<n>`; `shifted` the first live observations
-    under light, camera and clutter shifts, for `retrieval-score`; `executions` the live frames,
-    states and actions that follow each lesson; `questions` multiple-choice questions about the
-    past, for `ask`.
+    under shifts of light, camera, clutter and colors, for `retrieval-score`; `executions` the
+    live frames, states and actions that follow each lesson; `questions` multiple-choice questions
+    about the past, for `ask`.
 
     Examples:
     ```

@@ -48,7 +48,7 @@ _BUFFERS = f"{MANIFESTS}/{MANIFEST_ROWS}"
 _FOLDERS = {
     RAW_DISTRACTORS: "the distractor units at full rate",
     CONTRADICTIONS: "lessons in the scenes of the queries with other answers",
-    SHIFTED: "the first live observations under shifts of light, camera and clutter",
+    SHIFTED: "the first live observations under shifts of light, camera, clutter and colors",
     EXECUTIONS: "what follows each lesson: live frames, states and actions",
     DAYS: "recordings of a robot's days, many tasks without a cut",
 }

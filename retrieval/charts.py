@@ -10,7 +10,7 @@ from robomme_interference_data.schema.conditions import in_order, parse_conditio
 from robomme_interference_data.viz.figure import GRAY, INK, Hue, open_figure, save_figure, tidy
 
 from .calibrate import Calibration
-from .grade import ALL, PASS_MARK, Cell
+from .grade import ALL, PASS_MARK, Cell, is_family
 
 _COLORS = (INK, Hue.BLUE, Hue.VERMILION, Hue.GREEN, Hue.PINK, Hue.ORANGE, Hue.SKY)
 _MARKERS = "osD^vPXd*"
@@ -21,12 +21,11 @@ def draw_cells(cells: Sequence[Cell], title: str, out: Path) -> None:
     """Draw purity and coverage by condition: a line per family of one rule, or per rule."""
     rules = dict.fromkeys(cell.rule for cell in cells)
     lines: dict[str, list[Cell]] = {}
-    for cell in sorted(cells, key=lambda cell: cell.family != ALL):
-        if len(rules) == 1:
-            label = "all families" if cell.family == ALL else cell.family
-            lines.setdefault(label, []).append(cell)
-        elif cell.family == ALL:
-            lines.setdefault(cell.rule, []).append(cell)
+    for cell in sorted(cells, key=lambda cell: cell.part != ALL):
+        if cell.part == ALL:
+            lines.setdefault("all families" if len(rules) == 1 else cell.rule, []).append(cell)
+        elif len(rules) == 1 and is_family(cell):
+            lines.setdefault(cell.part, []).append(cell)
     names = [condition.name for condition in in_order({cell.condition for cell in cells})]
     with _two_panels(title, out) as panels:
         for axes, share in zip(panels, _SHARES, strict=True):

@@ -1,6 +1,6 @@
 """Grade choices against the true sessions, without a simulator and without IO.
 
-A cell is a family under one condition; it passes if mean purity and mean coverage are both at
+A cell is a family, or an ability, under one condition; it passes if mean purity and mean coverage are both at
 least `PASS_MARK` (released reference).
 """
 
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from robomme_interference_data.constants import ABILITIES
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.codec import to_dict
 from robomme_interference_data.schema.conditions import in_order
@@ -27,7 +28,7 @@ PASS_MARK = 0.9
 """Minimum mean purity and mean coverage of a cell that passes (released reference)."""
 
 ALL = "all"
-"""Name of all families together."""
+"""Name of all queries together."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +40,7 @@ class Grade:
         threshold: Cosine below which it cut; None if it does not cut.
         episode_id: The query episode.
         condition: Name of the condition.
+        ability: What a query of a day needs of a memory; None for others.
         history_frames: Frames of the history.
         segments: Number of segments; 0 if it does not cut.
         start: First chosen frame.
@@ -59,6 +61,7 @@ class Grade:
     threshold: float | None
     episode_id: EpisodeId
     condition: str
+    ability: str | None
     history_frames: int
     segments: int
     start: int
@@ -76,14 +79,14 @@ class Grade:
 
 @dataclass(frozen=True)
 class Cell:
-    """How well one rule chose for all queries of a family under one condition.
+    """How well one rule chose for some of the queries under one condition.
 
     Shares and means have 95% intervals, from `…_low` to `…_high`: Wilson's for `hit`, BCa bootstrap
     over episodes for the others, None for a single episode. `evidence_kept` is a mean over the
     queries for which it is known, None if there are none.
 
     Attributes:
-        family: A family, or `ALL`.
+        part: Whose queries they are: a family, an ability, or `ALL`.
         queries: Number of query episodes.
         hit: Share of them with a frame of the lesson chosen.
         purity, coverage, evidence_kept, false_sessions: Means over the grades.
@@ -92,7 +95,7 @@ class Cell:
     """
 
     rule: str
-    family: str
+    part: str
     condition: str
     queries: int
     hit: float
@@ -130,6 +133,7 @@ def grade(measured: Similarities, rule: Rule) -> Grade:
         threshold=choice.threshold,
         episode_id=measured.episode_id,
         condition=measured.condition,
+        ability=measured.ability,
         history_frames=len(measured.alike),
         segments=len(choice.segments),
         start=int(frames[0]),
@@ -147,23 +151,24 @@ def grade(measured: Similarities, rule: Rule) -> Grade:
 
 
 def cells(grades: Sequence[Grade]) -> Iterator[Cell]:
-    """Yield cells by rule, family (all families last) and condition.
+    """Yield cells by rule, part (families, abilities, all) and condition.
 
     The grades are of buffers that hold frames of the lesson; rules and families keep their order.
     """
     groups: dict[tuple[str, str, str], list[Grade]] = {}
     for graded in grades:
-        for family in (graded.episode_id.family, ALL):
-            groups.setdefault((graded.rule, family, graded.condition), []).append(graded)
+        for part in (graded.episode_id.family, graded.ability, ALL):
+            if part is not None:
+                groups.setdefault((graded.rule, part, graded.condition), []).append(graded)
     rules = dict.fromkeys(graded.rule for graded in grades)
-    families = [*dict.fromkeys(graded.episode_id.family for graded in grades), ALL]
+    families = dict.fromkeys(graded.episode_id.family for graded in grades)
     conditions = [graded.name for graded in in_order({graded.condition for graded in grades})]
-    for key in product(rules, families, conditions):
+    for key in product(rules, [*families, *ABILITIES, ALL], conditions):
         if key in groups:
             yield _cell(*key, groups[key])
 
 
-def _cell(rule: str, family: str, condition: str, grades: Sequence[Grade]) -> Cell:
+def _cell(rule: str, part: str, condition: str, grades: Sequence[Grade]) -> Cell:
     count, hits = len(grades), sum(graded.hit for graded in grades)
     means = [(g.purity, g.coverage, g.evidence_kept, g.false_sessions) for g in grades]
     values = np.array(means, float)  # NaN for None
@@ -173,7 +178,12 @@ def _cell(rule: str, family: str, condition: str, grades: Sequence[Grade]) -> Ce
     cuts = np.sum([(g.true_cuts, g.found_cuts, g.false_cuts) for g in grades], axis=0).tolist()
     passed = min(interval.value for interval in drawn[:2]) >= PASS_MARK
     columns: list[Any] = [hits / count, *wilson(hits, count), *bounds, *cuts, passed]
-    return Cell(rule, family, condition, count, *columns)
+    return Cell(rule, part, condition, count, *columns)
+
+
+def is_family(cell: Cell) -> bool:
+    """Whether the cell is of the queries of a family."""
+    return cell.part != ALL and cell.part not in ABILITIES
 
 
 # --- in words ----------------------------------------------------------------------------------
@@ -194,16 +204,16 @@ def verdict(cells: Sequence[Cell]) -> str:
     """Return for each rule how many cells of a family and a condition pass."""
     parts = []
     for rule in dict.fromkeys(cell.rule for cell in cells):
-        passed = [cell.passed for cell in cells if cell.rule == rule and cell.family != ALL]
+        passed = [cell.passed for cell in cells if cell.rule == rule and is_family(cell)]
         parts.append(f"{rule}: {sum(passed)} of {len(passed)}")
     return "Cells of a family and a condition that pass: " + ", ".join(parts)
 
 
 def cell_table(cells: Sequence[Cell], title: str) -> Table:
-    """Return a table by condition: of one rule by family, or of several rules."""
+    """Return a table by condition: of one rule by part, or of several rules."""
     several = len({cell.rule for cell in cells}) > 1
     columns: Columns = {
-        "rule" if several else "family": "text",
+        "rule" if several else "part": "text",
         "condition": "text",
         "queries": "count",
         "hit": "text",
@@ -217,7 +227,7 @@ def cell_table(cells: Sequence[Cell], title: str) -> Table:
     }
     rows = [
         (
-            cell.rule if several else cell.family,
+            cell.rule if several else cell.part,
             cell.condition,
             cell.queries,
             *(_share(cell, name) for name in ("hit", "purity", "coverage", "evidence_kept")),
@@ -227,7 +237,7 @@ def cell_table(cells: Sequence[Cell], title: str) -> Table:
             cell.passed,
         )
         for cell in cells
-        if not several or cell.family == ALL
+        if not several or cell.part == ALL
     ]
     table = Table("retrieval", title, columns, rows, _NOTE)
     return table.without_empty("evidence_kept")

@@ -34,6 +34,7 @@ class Similarities:
         embeddings: Returns the embeddings, `(T, D) float32`. It reads them again, because they take
             much memory for many buffers.
         evidence: Frames that show the hidden answer; None if unknown.
+        ability: What a query of a day needs of a memory; None for others.
     """
 
     episode_id: EpisodeId
@@ -44,6 +45,7 @@ class Similarities:
     typical: float
     embeddings: Callable[[], NDArray[np.float32]]
     evidence: tuple[Evidence, ...] | None = None
+    ability: str | None = None
 
     @property
     def lesson(self) -> tuple[FrameSpan, ...]:
@@ -78,6 +80,7 @@ def measure(
         buffer.index(encoder, camera).units.typical_cosine,
         lambda: buffer.embeddings(encoder, camera),
         buffer.evidence,
+        buffer.query.record.ability,
     )
 
 

@@ -41,6 +41,7 @@ def arguments() -> argparse.Namespace:
     add("--conditions", type=names, metavar="NAMES", help="NAME,…; all that apply if left out")
     add("--split", default="test", help="split of the episodes (%(default)s)")
     add("--retrieval", help="encoder of a retrieval step before the memory, such as thumbnail")
+    add("--retrieval-rule", default="max", help="what is kept then, as for evaluate (%(default)s)")
     add("--device", type=device, default=default_device(), help="cpu or cuda (%(default)s)")
     return parser.parse_args()
 
@@ -69,7 +70,8 @@ def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
     """Yield a row for each query episode under each condition."""
     config, buffer_set = model.config, load_buffer_set(args.buffer_set)
     memory = Memory.parse(config.memory)
-    step = StoredSelector(args.retrieval) if args.retrieval else None
+    rule = args.retrieval_rule
+    step = StoredSelector(args.retrieval, rule=rule) if args.retrieval else None
     label = None if step is None else step.label(buffer_set.datasets[DEMONSTRATIONS])
     weights = sha256_file(args.checkpoint / "model.safetensors")[:16]
     applying = [one for one in buffer_set.conditions if step is None or one != NO_HISTORY]
@@ -84,6 +86,7 @@ def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
             split=args.split,
             questions=True,
             retrieval=args.retrieval,
+            retrieval_rule=rule,
             quiet=True,
         )
         right = 0
@@ -118,6 +121,7 @@ def rows(model: MemoryModel, args: argparse.Namespace) -> Iterator[Rollout]:
                     protocol_version=PROTOCOL_VERSION,
                     seed=record.seed,
                     difficulty=record.difficulty,
+                    ability=record.ability,
                     goal=record.goal,
                     status="success" if success else "fail",
                     success=success,

@@ -106,7 +106,7 @@ def test_scores_as_json_and_the_same_every_time(run: Run, tmp_path: Path, indexe
     for name in ("cells.csv", "rows.csv", "retrieval.png"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     found = json.loads(runs[0][1])
-    cells = {(cell["family"], cell["condition"]): cell for cell in found.pop("cells")}
+    cells = {(cell["part"], cell["condition"]): cell for cell in found.pop("cells")}
     assert found == {
         "buffer_set": "buffer_set",
         "revision": load_buffer_set(indexed).revision,

@@ -23,6 +23,7 @@ def test_a_grade_by_hand() -> None:
         threshold=0.5,
         episode_id=one.episode_id,
         condition="k2",
+        ability=None,
         history_frames=15,
         segments=4,
         start=4,
@@ -88,7 +89,7 @@ def four() -> list[Grade]:
 
 def test_cells_by_hand() -> None:
     found = list(cells(four()))
-    assert [(c.family, c.condition, c.queries) for c in found] == [
+    assert [(c.part, c.condition, c.queries) for c in found] == [
         ("MoveCube", "k0", 1),
         ("MoveCube", "k2", 2),
         ("InsertPeg", "k2", 1),
@@ -113,6 +114,14 @@ def test_cells_by_hand() -> None:
     assert (both.true_cuts, both.found_cuts, both.false_cuts) == (4, 2, 2)
     assert (single.true_cuts, single.found_cuts, single.false_cuts) == (0, 0, 0)
     assert verdict(found).endswith("pass: max/0.5: 1 of 3")
+
+
+def test_abilities_have_cells_beside_families() -> None:
+    needs = ("recall", "update", "recall", None)
+    graded = [replace(one, ability=need) for one, need in zip(four(), needs, strict=True)]
+    found = [(cell.part, cell.condition, cell.queries) for cell in cells(graded)]
+    assert found[3:] == [("recall", "k2", 2), ("update", "k2", 1), (ALL, "k0", 1), (ALL, "k2", 3)]
+    assert verdict([*cells(graded)]).endswith("pass: max/0.5: 1 of 3")
 
 
 @pytest.mark.parametrize(("first", "passed"), [(1, True), (2, False)])
