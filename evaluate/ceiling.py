@@ -8,6 +8,7 @@ function of manifests and records: nothing is decoded or simulated, and there is
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+from robomme_interference_data.constants import ABILITIES
 from robomme_interference_data.data.buffer import Buffer
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.query import Query
@@ -30,10 +31,10 @@ _Kept = tuple[float | None, float | None]
 
 @dataclass(frozen=True)
 class Ceiling:
-    """Means over the queries of a family, or of `ALL`, under one condition.
+    """Means over some of the queries under one condition.
 
     Attributes:
-        family: The family, or `ALL`.
+        part: Which queries they are: those of a family or of an ability, or `ALL`.
         condition: Name of the condition.
         queries: Number of queries.
         evidence_kept: Mean share of the lesson's evidence spans of which the memory keeps a frame,
@@ -42,7 +43,7 @@ class Ceiling:
             answers are known; None without any.
     """
 
-    family: str
+    part: str
     condition: str
     queries: int
     evidence_kept: float | None
@@ -50,7 +51,7 @@ class Ceiling:
 
 
 def ceiling(buffer_set: BufferSet, config: CeilingConfig) -> list[Ceiling]:
-    """Return the ceiling of a memory on a buffer set, by family and for all, and by condition."""
+    """Return the ceiling of a memory on a buffer set, by part and condition."""
     memory = Memory.parse(config.memory)
     if config.frames < 1:
         raise InvalidOptionError.expected("frames", config.frames, "1 or more")
@@ -75,15 +76,16 @@ def ceiling(buffer_set: BufferSet, config: CeilingConfig) -> list[Ceiling]:
             if received is None:
                 continue
             kept = _kept(buffer, memory, received, config.frames)
-            for family in (buffer.episode_id.family, ALL):
-                cells.setdefault((family, buffer.condition), []).append(kept)
+            for part in (buffer.episode_id.family, buffer.query.record.ability, ALL):
+                if part is not None:
+                    cells.setdefault((part, buffer.condition), []).append(kept)
     ceilings = []
-    for family in (*buffer_set.families, ALL):
+    for part in (*buffer_set.families, *ABILITIES, ALL):
         for name in names:
-            queries = cells.get((family, name))
+            queries = cells.get((part, name))
             if queries:
                 shares, chances = zip(*queries, strict=True)
-                ceilings.append(Ceiling(family, name, len(queries), _mean(shares), _mean(chances)))
+                ceilings.append(Ceiling(part, name, len(queries), _mean(shares), _mean(chances)))
     return ceilings
 
 
@@ -157,13 +159,13 @@ def ceiling_table(cells: Sequence[Ceiling], title: str) -> Table:
         "ceiling",
         title,
         {
-            "family": "text",
+            "part": "text",
             "condition": "text",
             "queries": "count",
             "evidence_kept": "rate",
             "expected_success": "rate",
         },
-        [(c.family, c.condition, c.queries, c.evidence_kept, c.success) for c in cells],
+        [(c.part, c.condition, c.queries, c.evidence_kept, c.success) for c in cells],
         "evidence kept: mean share of the lesson's evidence spans of which the memory keeps a "
         "frame at the first step, empty without a lesson; expected success: of the ideal observer "
         "(recall), which knows these parts of the answer and draws one of the answers that agree. "

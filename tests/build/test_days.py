@@ -28,7 +28,10 @@ from robomme_interference_data.build_dataset.dataset.build import build_dataset
 from robomme_interference_data.cards.dataset_facts import buffer_set_facts
 from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.cards.render import card_text
+from robomme_interference_data.constants import ABILITIES
 from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
+from robomme_interference_data.evaluate.ceiling import ceiling
+from robomme_interference_data.evaluate.run.config import CeilingConfig
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.schema.records import DaySpan
@@ -168,6 +171,24 @@ def test_a_buffer_shows_its_spans(root: Path, condition: str) -> None:
     assert np.array_equal(streamed, buffer.frames("front"))
     assert np.array_equal(np.concatenate([chunk.states for chunk in chunks]), buffer.states)
     assert buffer.manifest.lesson_frames == 6
+
+
+def test_abilities_have_ceilings(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Its lessons show other parts than the scenes of the simulator whose name it has.
+    monkeypatch.setattr("robomme_interference_data.evaluate.ceiling.recorded_scene", lambda _: None)
+    config = CeilingConfig("full", conditions=("day-k2",))
+    found = {
+        cell.part: (cell.queries, cell.evidence_kept)
+        for cell in ceiling(load_buffer_set(root), config)
+    }
+    assert {part: found[part] for part in found if part in ABILITIES} == {
+        "recall": (2, 1.0),
+        "several": (1, 1.0),
+        "update": (1, 1.0),
+        "order-first": (1, 1.0),
+        "absent": (2, None),
+    }
+    assert found["all"] == (7, 1.0)
 
 
 def test_its_card_counts_the_days(root: Path) -> None:

@@ -30,7 +30,7 @@ from robomme_interference_data.simulators.tabletop.families import draw_episode
 def kept(buffer_set: Path, **settings: Any) -> dict[tuple[str, str], float | None]:
     cells = ceiling(load_buffer_set(buffer_set), CeilingConfig(**settings))
     assert all(cell.success is None for cell in cells)  # made-up episodes have no answers
-    return {(cell.family, cell.condition): cell.evidence_kept for cell in cells}
+    return {(cell.part, cell.condition): cell.evidence_kept for cell in cells}
 
 
 def test_evidence_kept_by_hand(tiny_buffers: Path) -> None:
@@ -98,7 +98,7 @@ def test_a_part_that_needs_more_frames_than_are_kept_is_unknown() -> None:
         frames: {
             cell.condition: cell.success
             for cell in ceiling(buffer_set, CeilingConfig(memory="full", frames=frames))
-            if cell.family == ALL
+            if cell.part == ALL
         }
         for frames in (1, 1000)
     }

@@ -1,0 +1,41 @@
+#!/bin/bash
+# Builds twelve test days and measures what docs/results/day.md states: `day.sh` builds, asks and
+# grades; `day.sh act` rolls out the queries of four days. Run it in an empty folder.
+set -euo pipefail
+conditions=no-history,day-alone,day-k0,day-k1,day-k3,day-k7,day-cut-k0,day-cut-k1,day-cut-k3,day-cut-k7
+
+if [ "${1:-}" = act ]; then
+    roll() {
+        robomme-interference evaluate test-days --simulator tabletop-day --episodes 0-7 "$@"
+    }
+    roll --policy replay:framesamp --conditions day-alone,day-k7,day-cut-k7 --out acted/replay
+    roll --policy replay:framesamp --conditions day-k7 --retrieval thumbnail \
+        --set retrieval_rule=changes --out acted/replay-changes
+    roll --policy recall:framesamp:128 --conditions day-k7 --out acted/recall
+    exit
+fi
+
+robomme-interference build test-days --source tabletop-day --split test --episodes 0-11 \
+    --unit-episodes 0-3 --cameras front --position-limit none --conditions $conditions
+robomme-interference build test-days --only questions
+robomme-interference index test-days --encoder thumbnail
+robomme-interference verify test-days --audit
+
+declare -A memories=(
+    [full]=full [framesamp-32]=framesamp:32 [framesamp-128]=framesamp:128 [window-60s]=window:60@2
+)
+for name in "${!memories[@]}"; do
+    robomme-interference ceiling test-days --memory "${memories[$name]}" --json > "ceiling-$name.json"
+    robomme-interference ask test-days --model recall --memory "${memories[$name]}" \
+        --system "recall-$name" --out "asked/recall-$name"
+    for rule in max window windows3 changes; do
+        robomme-interference ask test-days --model recall --memory "${memories[$name]}" \
+            --retrieval thumbnail --retrieval-rule $rule --conditions day-k7 \
+            --system "recall-$name-$rule" --out "asked/recall-$name-$rule"
+    done
+done
+for model in guess abstain; do
+    robomme-interference ask test-days --model $model --conditions no-history,day-k7 --out asked/$model
+done
+robomme-interference retrieval-score test-days --rules max,window,windows3,changes,oracle \
+    --conditions day-alone,day-k0,day-k7,day-cut-k7 --out graded
