@@ -1,17 +1,17 @@
 #!/bin/bash
 # Builds twelve test days and measures what docs/results/day.md states: `day.sh` builds, asks and
-# grades; `day.sh act` rolls out the queries of four days. Run it in an empty folder.
+# grades; then `day.sh act` rolls out the queries of three families. Run it in an empty folder.
 set -euo pipefail
 conditions=no-history,day-alone,day-k0,day-k1,day-k3,day-k7,day-cut-k0,day-cut-k1,day-cut-k3,day-cut-k7
 
 if [ "${1:-}" = act ]; then
     roll() {
-        robomme-interference evaluate test-days --simulator tabletop-day --episodes 0-7 "$@"
+        robomme-interference evaluate test-days --simulator tabletop-day \
+            --families MoveCube,PatternLock,RouteStick --workers 2 "$@"
     }
     roll --policy replay:framesamp --conditions day-alone,day-k7,day-cut-k7 --out acted/replay
     roll --policy replay:framesamp --conditions day-k7 --retrieval thumbnail \
-        --set retrieval_rule=changes --out acted/replay-changes
-    roll --policy recall:framesamp:128 --conditions day-k7 --out acted/recall
+        --retrieval-rule changes --out acted/replay-changes
     exit
 fi
 
