@@ -54,7 +54,7 @@ class DaySource(SimulatorSource):
             return [SourceEpisode(day) for day in days]
         return sorted(
             (
-                SourceEpisode(query, number=day.index, ability=ability_of(query))
+                SourceEpisode(query, day=day, ability=ability_of(query))
                 for day in days
                 for query in queries_of(day)
             ),

@@ -30,6 +30,7 @@ from robomme_interference_data.cards.dataset_facts import buffer_set_facts
 from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.cards.render import card_text
 from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
+from robomme_interference_data.evaluate.day_shortcuts import day_cues
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.schema.records import DaySpan
@@ -183,6 +184,22 @@ def test_a_buffer_shows_its_spans(root: Path, condition: str) -> None:
     assert buffer.manifest.lesson_frames == 6
 
 
+def test_what_a_policy_sees_of_a_query_without_a_memory(root: Path, run: Any) -> None:
+    found = {
+        one.condition: one
+        for one in day_cues(load_buffer_set(root))
+        if (one.family, one.ability) == ("VideoUnmask", "update")
+    }
+    whole, cut, short = (found[name] for name in ("day-k2", "day-cut-k2", "day-k0"))
+    assert whole.task == 2 and short.delay == 0
+    assert cut.length == 5 * 6 and cut.delay == 2 * 6  # of five tasks, without transitions
+    assert cut.clock == whole.clock == whole.length == short.length + whole.delay
+    code, out, _ = run("verify", root, "--audit", "--json")
+    report = json.loads(out)
+    assert code == 0 and not report["violations"]
+    assert {row["condition"] for row in report["day_shortcuts"]} == {*found}
+
+
 def test_its_card_counts_the_days(root: Path) -> None:
     card = card_text(buffer_set_facts(load_buffer_set(root)), Publication("a/b", "1.0.0"))
     assert "days" in card and "day-cut-k2" in card
@@ -198,6 +215,26 @@ def test_no_lesson_without_one_before_anything_is_built(tmp_path: Path, run: Any
         *("--unit-episodes", "0", "--conditions", "k0,day-k0"),
     )
     assert code == 1 and ABSENT in err and "day-k0" in err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        # Its last lesson is task 5 of 0 to 7.
+        (("--conditions", "no-history,day-k3", "--position-limit", "none"), "day-k2"),
+        (("--conditions", "day-k2", "--position-limit", "2000"), "--position-limit none"),
+    ],
+)
+def test_what_no_day_holds_before_anything_is_built(
+    options: tuple[str, ...], expected: str, tmp_path: Path, run: Any
+) -> None:
+    out = tmp_path / "buffers"
+    code, _, err = run(
+        *("build", out, "--source", "tabletop-day:8", "--split", "test", "--episodes", "1"),
+        *("--unit-episodes", "0", *options),
+    )
+    assert code == 1 and "VideoPlaceButton/test/1" in err and expected in err
     assert not out.exists()
 
 
