@@ -279,6 +279,7 @@ def day_shortcut_table(measured: Sequence[DayShortcut], title: str) -> Table:
         "right guesses of the answer, or of the ability, without the history's frames: that of the "
         "query nearest in length of the history, frames since the day began, task after which it "
         "can be asked, frames after that task, or first live observation, among others of the same "
-        "family and difficulty (abilities: of families with the same abilities). By chance: the mean over permutations of the answers; "
-        "least p: the smallest of the cues' one-sided p-values, not adjusted.",
+        "family and difficulty (abilities: of families with the same abilities). By chance: the "
+        "mean over permutations of the answers; least p: the smallest of the cues' one-sided "
+        "p-values, not adjusted.",
     )
