@@ -26,6 +26,7 @@ from robomme_interference_data.schema.manifest import BufferManifest
 from robomme_interference_data.schema.records import Day
 from robomme_interference_data.simulators.registry import recorded_scene
 from robomme_interference_data.stats.bootstrap import generator_of
+from robomme_interference_data.stats.significance import holm
 from robomme_interference_data.viz.tables import Columns, Table
 
 CUES = ("length", "clock", "task", "delay", "view")
@@ -258,7 +259,7 @@ def day_shortcut_table(measured: Sequence[DayShortcut], title: str) -> Table:
     """Return the table for the terminal: a row for all cues, which have the same queries."""
     columns: Columns = {"condition": "text", "guessed": "text", "ability": "text"}
     columns |= {"queries": "count", "by_chance": "number"}
-    columns |= dict.fromkeys(CUES, "count") | {"least_p": "p"}
+    columns |= dict.fromkeys(CUES, "count") | {"p": "p"}
     rows: dict[tuple[str, str, str], dict[str, DayShortcut]] = {}
     for one in measured:
         rows.setdefault((one.condition, one.target, one.ability), {})[one.cue] = one
@@ -272,7 +273,7 @@ def day_shortcut_table(measured: Sequence[DayShortcut], title: str) -> Table:
                 cues["length"].queries,
                 float(np.mean([one.expected for one in cues.values()])),
                 *(cues[cue].right if cue in cues else None for cue in CUES),
-                min(one.p for one in cues.values()),
+                min(holm([one.p for one in cues.values()])),
             )
             for names, cues in rows.items()
         ],
@@ -280,6 +281,6 @@ def day_shortcut_table(measured: Sequence[DayShortcut], title: str) -> Table:
         "query nearest in length of the history, frames since the day began, task after which it "
         "can be asked, frames after that task, or first live observation, among others of the same "
         "family and difficulty (abilities: of families with the same abilities). By chance: the "
-        "mean over permutations of the answers; least p: the smallest of the cues' one-sided "
-        "p-values, not adjusted.",
+        "mean over permutations of the answers; p: the smallest of the cues' one-sided p-values, "
+        "adjusted by Holm's method.",
     )
