@@ -259,7 +259,8 @@ def day_shortcut_table(measured: Sequence[DayShortcut], title: str) -> Table:
     """Return the table for the terminal: a row for all cues, which have the same queries."""
     columns: Columns = {"condition": "text", "guessed": "text", "ability": "text"}
     columns |= {"queries": "count", "by_chance": "number"}
-    columns |= dict.fromkeys(CUES, "count") | {"p": "p"}
+    columns |= {cue: "count" for cue in CUES}
+    columns["p"] = "p"
     rows: dict[tuple[str, str, str], dict[str, DayShortcut]] = {}
     for one in measured:
         rows.setdefault((one.condition, one.target, one.ability), {})[one.cue] = one

@@ -83,7 +83,8 @@ def verify(
     list everything that is wrong, by episode and frame.
 
     With --audit, a leak fails as well. A policy can use lesson length, goal and first live
-    observation without any memory: each episode is guessed from the others of its family.
+    observation without any memory: each episode is guessed from the others of its family. Queries
+    of days are also guessed from the clock and the place of their lessons.
 
     Examples:
     ```

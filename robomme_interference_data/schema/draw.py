@@ -167,7 +167,7 @@ def check_units(
     for query in [*in_days, *checked.values(), *sorted(absent)]:
         for condition in chosen:
             provider = _UnreadSessions(query, pool, query in absent, days.get(query))
-            frames = sum(session.frames for session in condition.sessions(provider))
+            frames = sum(session.num_frames for session in condition.sessions(provider))
             if position_limit is not None and frames + MAX_STEPS > position_limit:
                 what = f"{query} under {condition}"
                 raise too_long(what, f"at least {frames}", frames, position_limit)
@@ -248,7 +248,7 @@ class _Unread(NamedTuple):
     """A session that is not read yet, with the number of frames that is certain."""
 
     role: str
-    frames: int = 0
+    num_frames: int = 0
 
 
 def _hash(seed: int, *parts: str) -> bytes:

@@ -26,11 +26,7 @@ COLORS = (Hue.SKY, Hue.ORANGE, Hue.GREEN, Hue.PINK, Hue.BLUE, Hue.YELLOW, "#9999
 CONTRADICTION_COLOR = "#7F3300"
 """A dark one of the lesson's: both show the query's scene, and distractors may have its family."""
 
-_BY_ROLE = {
-    "lesson": LESSON_COLOR,
-    "contradiction": CONTRADICTION_COLOR,
-    "transition": "#dddddd",
-}
+_BY_ROLE = {"lesson": LESSON_COLOR, "contradiction": CONTRADICTION_COLOR, "transition": "#dddddd"}
 """Colors of roles; sessions of others have one of their family."""
 
 _KEY = {"contradiction": "contradicting lesson"}
