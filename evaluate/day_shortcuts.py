@@ -2,10 +2,11 @@
 
 Policies receive the length of the history and the first live observation, and may count the tasks
 in the history. One that guesses from these looks like one that remembers. Here each query's answer
-is guessed to be that of another query (leave-one-out): the one of the same family and difficulty
-that is nearest by a single cue. Its ability is guessed alike, among queries of families with the
-same abilities. Permuting the answers, or abilities, among the same queries shows how many guesses
-would be right if the cue had nothing to do with them.
+is guessed to be that of a query of another day: the one of the same family and difficulty that is
+nearest by a single cue. Its ability is guessed alike, among queries of families with the same
+abilities. Permuting the answers, or abilities, among the same queries shows how many guesses would
+be right if the cue had nothing to do with them. Queries of one day are never compared: no two
+lessons are at the same moment of it, so where one query is asked tells about the others.
 """
 
 from collections.abc import Hashable, Iterator, Sequence
@@ -18,12 +19,13 @@ from numpy.typing import NDArray
 from robomme_interference_data.constants import ABILITIES, DAYS
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.query import Query
+from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.retrieval.encoders.thumbnail import Thumbnail
 from robomme_interference_data.retrieval.grade import ALL
 from robomme_interference_data.schema.conditions import parse_condition
 from robomme_interference_data.schema.days import IN_PIECES
 from robomme_interference_data.schema.manifest import BufferManifest
-from robomme_interference_data.schema.records import Day
+from robomme_interference_data.schema.records import Day, DaySpan
 from robomme_interference_data.simulators.registry import recorded_scene
 from robomme_interference_data.stats.bootstrap import generator_of
 from robomme_interference_data.stats.significance import holm
@@ -42,6 +44,7 @@ class DayCues:
 
     Attributes:
         condition: Name of the condition.
+        day: The day.
         family, difficulty: Those of the query episode.
         ability: What the query needs of a memory.
         answer: Number of the right answer among those that the scene allows; None if unknown.
@@ -53,6 +56,7 @@ class DayCues:
     """
 
     condition: str
+    day: EpisodeId
     family: str
     difficulty: str | None
     ability: str
@@ -73,7 +77,7 @@ class DayShortcut:
         target: What is guessed: `answer` or `ability`.
         ability: The ability, or `ALL`.
         cue: One of `CUES`.
-        queries: Number of queries with others to guess from.
+        queries: Number of queries with others, of other days, to guess from.
         right: Right guesses.
         expected: Mean of right guesses over the permutations.
         p: Share of permutations, the observed order among them, with as many right guesses or more.
@@ -98,7 +102,7 @@ def day_cues(buffer_set: BufferSet) -> list[DayCues]:
     if days is None:
         return []
     asked = {
-        query.episode: (record.day, query.task)
+        query.episode: (record.episode_id, record.day, query.task)
         for record in days.records()
         if record.day is not None
         for query in record.day.queries
@@ -126,23 +130,25 @@ class _Asked:
     """A query of a day, with what does not depend on the condition."""
 
     query: Query
-    day: Day
+    day: EpisodeId
+    spans: Sequence[DaySpan]
     task: int
     answer: int | None
     view: NDArray[np.uint8] | None
 
     @classmethod
-    def of(cls, query: Query, day: Day, task: int) -> "_Asked":
+    def of(cls, query: Query, name: EpisodeId, day: Day, task: int) -> "_Asked":
         view = query.frame() if query.dataset.cameras else None
-        return cls(query, day, task, _answer(query), view)
+        return cls(query, name, day.spans, task, _answer(query), view)
 
     def cues(self, manifest: BufferManifest) -> DayCues:
         """Return the cues under a condition."""
         record, sessions = self.query.record, manifest.sessions
-        tasks = [span for span in self.day.spans if span.part != "transition"]
+        tasks = [span for span in self.spans if span.part != "transition"]
         asked = tasks[self.task].stop
         return DayCues(
             manifest.condition,
+            self.day,
             record.episode_id.family,
             record.difficulty,
             str(record.ability),
@@ -190,28 +196,40 @@ def _measure(
     values: Sequence[Hashable],
 ) -> Iterator[DayShortcut]:
     """Yield what each cue reveals of values, which are guessed within groups."""
-    compared = [at for at, group in enumerate(groups) if groups.count(group) > 1]
+    days_of: dict[Hashable, set[EpisodeId]] = {}
+    for asked, one in zip(queries, groups, strict=True):
+        days_of.setdefault(one, set()).add(asked.day)
+    compared = [at for at, one in enumerate(groups) if len(days_of[one]) > 1]
     if not compared:
         return
     queries = [queries[at] for at in compared]
+    day = _numbers([asked.day for asked in queries])
     group = _numbers([groups[at] for at in compared])
     value = _numbers([values[at] for at in compared])
     permuted = _permuted(value, group, f"shortcuts {condition} {target}")
-    abilities = np.array([asked.ability for asked in queries])
-    parts = {ability: abilities == ability for ability in ABILITIES if ability in abilities}
-    parts[ALL] = np.ones(len(queries), bool)
+    ability = _numbers([asked.ability for asked in queries])
+    # Permuted abilities are of other queries.
+    permuted_ability = permuted if target == "ability" else ability
+    numbers = {asked.ability: number for asked, number in zip(queries, ability, strict=True)}
+    known = [name for name in ABILITIES if name in numbers]
+
+    def needing(name: str, abilities: NDArray[np.int64]) -> NDArray[np.bool_]:
+        return abilities == numbers[name] if name in numbers else np.ones(abilities.shape, bool)
+
     for cue in CUES:
         features = _features(queries, cue)
         if features is None:
             continue
-        guessed_from = nearest(features, group)
+        guessed_from = nearest(features, group, day)
         right = value[guessed_from] == value
         by_chance = permuted[:, guessed_from] == permuted
-        for ability, part in parts.items():
-            count, counts = int(right[part].sum()), by_chance[:, part].sum(axis=1)
+        for name in (*known, ALL):
+            part = needing(name, ability)
+            count = int((right & part).sum())
+            counts = (by_chance & needing(name, permuted_ability)).sum(axis=1)
             p = (1 + int((counts >= count).sum())) / (1 + PERMUTATIONS)
             yield DayShortcut(
-                condition, target, ability, cue, int(part.sum()), count, float(counts.mean()), p
+                condition, target, name, cue, int(part.sum()), count, float(counts.mean()), p
             )
 
 
@@ -239,17 +257,21 @@ def _features(queries: Sequence[DayCues], cue: str) -> NDArray[Any] | None:
     return Thumbnail().prepare(np.stack(views)) if len(views) == len(queries) else None
 
 
-def nearest(features: NDArray[Any], groups: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the nearest other one of the same group for each of N, of equally near ones the first.
+def nearest(
+    features: NDArray[Any], groups: NDArray[np.int64], days: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return the nearest one of the same group and another day for each of N.
+
+    Of equally near ones it is the first.
 
     Args:
         features: `(N, D)`; distances are Euclidean.
-        groups: `(N,)`, each group at least twice.
+        groups: `(N,)`, each with several days.
+        days: `(N,)`.
     """
     found = []
     for at, feature in enumerate(features):
-        others = np.flatnonzero(groups == groups[at])
-        others = others[others != at]
+        others = np.flatnonzero((groups == groups[at]) & (days != days[at]))
         distances = ((features[others] - feature) ** 2).sum(axis=1, dtype=np.float64)
         found.append(others[np.argmin(distances)])
     return np.array(found)
@@ -280,8 +302,9 @@ def day_shortcut_table(measured: Sequence[DayShortcut], title: str) -> Table:
         ],
         "right guesses of the answer, or of the ability, without the history's frames: that of the "
         "query nearest in length of the history, frames since the day began, task after which it "
-        "can be asked, frames after that task, or first live observation, among others of the same "
-        "family and difficulty (abilities: of families with the same abilities). By chance: the "
+        "can be asked, frames after that task, or first live observation, among those of other "
+        "days and the same family and difficulty (abilities: families with the same abilities). By "
+        "chance: the "
         "mean over permutations of the answers; p: the smallest of the cues' one-sided p-values, "
         "adjusted by Holm's method.",
     )
