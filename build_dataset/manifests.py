@@ -34,6 +34,7 @@ from robomme_interference_data.data.set_files import pending_rows
 from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError, named
 from robomme_interference_data.schema.codec import arrow_schema, to_dict, to_table
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS, Condition, in_order
+from robomme_interference_data.schema.draw import too_long
 from robomme_interference_data.schema.manifest import (
     BufferManifest,
     ManifestDataset,
@@ -122,14 +123,9 @@ def planned_buffers(plan: ManifestPlan) -> Iterator[BufferManifest]:
         }
         for condition in plan.conditions:
             manifest, limit = buffers[condition.name], plan.position_limit
-            needed = manifest.history_frames + MAX_STEPS
-            if limit is not None and needed > limit:  # rule 8
-                raise InvalidOptionError(
-                    f"{manifest} needs {needed} positions ({manifest.history_frames} history "
-                    f"frames + {MAX_STEPS} steps); the limit is {limit}",
-                    f"Leave out the condition, or set {named('position_limit', 'none')} for "
-                    "systems without a limit.",
-                )
+            frames = manifest.history_frames
+            if limit is not None and frames + MAX_STEPS > limit:  # rule 8
+                raise too_long(str(manifest), str(frames), frames, limit)
             yield manifest
 
 

@@ -1,7 +1,7 @@
 """The tables of cards; their texts are already Markdown."""
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from itertools import chain
 from statistics import mean, median
@@ -178,12 +178,16 @@ def columns_of(record: Any) -> tuple[CardColumn, ...]:
 
 def column_table(record: type) -> Table:
     """Return the columns of a record as a table."""
-    rows = []
-    for column in columns_of(record):
-        rows.append((code(column.name), column.words, escape(column.meaning)))
-        for part in column.parts:
-            rows.append((code(f"{column.name}.{part.name}"), part.words, escape(part.meaning)))
+    rows = [*_column_rows(columns_of(record), "")]
     return Table("columns", "Columns", {"column": "text", "type": "text", "meaning": "text"}, rows)
+
+
+def _column_rows(columns: Iterable[CardColumn], within: str) -> Iterator[tuple[str, str, str]]:
+    """Yield name, type and meaning of columns, and of the fields of records in them."""
+    for column in columns:
+        name = within + column.name
+        yield code(name), column.words, escape(column.meaning)
+        yield from _column_rows(column.parts, f"{name}.")
 
 
 def _record_in(hint: Any) -> Any:

@@ -82,10 +82,11 @@ def check_plans(
     planned: PlannedBuffers | None,
     request: BuffersConfig,
     absent: Collection[EpisodeId] = (),
+    days: Mapping[EpisodeId, EpisodeId] | None = None,
 ) -> NextBuffers:
     """Check that datasets can be built or extended, and that units suffice; return the buffers.
 
-    `absent` are the query episodes whose lesson is never shown.
+    `absent` are the query episodes whose lesson is never shown, `days` those of queries of days.
     """
     existing = {kind: open_existing(root.resolve() / kind, plan) for kind, plan in plans.items()}
     demonstrations = existing.get(DEMONSTRATIONS)
@@ -99,7 +100,7 @@ def check_plans(
     available = {replace(unit.episode.id, start=n) for unit in units.episodes for n in range(most)}
     if built is not None:
         available |= built.ids
-    _check_units(available, queries, following, absent)
+    _check_units(available, queries, following, absent, days or {})
     check_manifests_folder(root)
     return following
 
@@ -109,9 +110,11 @@ def _check_units(
     queries: Collection[EpisodeId],
     following: NextBuffers,
     absent: Collection[EpisodeId],
+    days: Mapping[EpisodeId, EpisodeId],
 ) -> None:
+    conditions, limit = following.conditions, following.position_limit
     try:
-        check_units(UnitPool(available), queries, following.conditions, absent)
+        check_units(UnitPool(available), queries, conditions, absent, days, limit)
     except BuildError as error:
         splits = {query.split for query in queries}
         if not {"train", "test"} <= splits:

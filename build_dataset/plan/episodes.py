@@ -97,7 +97,7 @@ def in_selection(episode: SourceEpisode, split: str | None, indices: Container[i
         return False
     if indices is None:
         return not episode.further
-    return (episode.id.index if episode.number is None else episode.number) in indices
+    return (episode.day or episode.id).index in indices
 
 
 def _described(episodes: Iterable[EpisodeId]) -> str:

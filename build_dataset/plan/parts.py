@@ -177,14 +177,13 @@ def _plan_whole(config: BuildConfig, request: BuffersConfig) -> BuildPlan:
             plans[name] = plan_dataset(name, _with_cameras_of(base, config), queries)
         if base is not None:
             plans[name] = plans[name].matching(base)
+    days = {}
     if base is None:
-        queries = {query.episode.id for query in plans[DEMONSTRATIONS].episodes}
-        absent = {
-            query.episode.id
-            for query in plans[DEMONSTRATIONS].episodes
-            if query.episode.ability == "absent"
-        }
-    change = check_plans(queries, plans, root, planned, request, absent)
+        chosen = [query.episode for query in plans[DEMONSTRATIONS].episodes]
+        queries = {episode.id for episode in chosen}
+        absent = {episode.id for episode in chosen if episode.ability == "absent"}
+        days = {episode.id: episode.day for episode in chosen if episode.day is not None}
+    change = check_plans(queries, plans, root, planned, request, absent, days)
     return BuildPlan(plans, change, True, QUESTIONS in config.parts, base)
 
 

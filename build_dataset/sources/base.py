@@ -62,7 +62,7 @@ class SourceEpisode:
             the file's time and size). Must be picklable.
         marked: False if the source knows that it cannot tell where the demonstration ends.
         further: Whether it is built only if its number is given.
-        number: Number that chooses it, if that is not its index: of a query of a day, the day's.
+        day: The day that a query of a day is asked about, whose number chooses it; None for others.
         ability: What a query of a day needs of a memory; None for others.
         problem: Why it cannot be used, if the list already shows that; None if it can be read.
     """
@@ -71,7 +71,7 @@ class SourceEpisode:
     key: Any = field(default=None, compare=False)
     marked: bool = field(default=True, compare=False)
     further: bool = field(default=False, compare=False)
-    number: int | None = field(default=None, compare=False)
+    day: EpisodeId | None = field(default=None, compare=False)
     ability: str | None = field(default=None, compare=False)
     problem: InterferenceError | None = field(default=None, compare=False)
 

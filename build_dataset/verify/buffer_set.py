@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from robomme_interference_data.constants import (
+    DAYS,
     DEMONSTRATIONS,
     DISTRACTORS,
     EXECUTIONS,
@@ -32,6 +33,7 @@ from robomme_interference_data.storage.video.encode import CODECS
 
 from .dataset import HEADER, UNLISTED, Violation, caught, dataset_violations, index_violations
 from .planned_again import buffer_violations, question_violations
+from .planned_days import day_violations
 from .set_files import further_files, unfinished_builds
 
 _ROWS = f"{MANIFESTS}/{MANIFEST_ROWS}"
@@ -44,10 +46,10 @@ def verify_buffer_set(
 
     Checked are: the SHA-256 of every file, and that none is missing or unlisted; with `decode`,
     every frame and vector of every episode against its recorded hashes; LeRobot's columns;
-    the hashes of embeddings, which are not recomputed; every manifest row and question, which are
-    planned again from the datasets, rules and seed and compared; with `decode`, the first frame of
-    every execution against the first live observation, and the questions' pictures, if Pillow is
-    installed.
+    the hashes of embeddings, which are not recomputed; days, abilities, every manifest row and
+    every question, which are planned again from the datasets, rules and seed and compared; with
+    `decode`, the first frame of every execution against the first live observation, and the
+    questions' pictures, if Pillow is installed.
 
     Args:
         buffer_set: The buffer set; one on the Hub is downloaded completely.
@@ -142,6 +144,7 @@ def _datasets(
     for name, dataset in datasets.items():
         yield from caught(name, dataset_violations(name, dataset, header, units, progress, copy))
         yield from index_violations(name, dataset, units, copy)
+    yield from caught(DAYS, day_violations(datasets))
 
 
 def undecoded_frames(buffer_set: BufferSet) -> int:

@@ -184,8 +184,8 @@ def plan_replay(
             simulator_options=simulator_options,
         )
         stored = [*dataset.identity.sources]
-        version = _suite_version(simulator, source.provenance)
-        if any(_suite_version(simulator, entry) != version for entry in stored):
+        version = suite_version(simulator, source.provenance)
+        if any(suite_version(simulator, entry) != version for entry in stored):
             what = f"sources are {stored}; {simulator} is {source.provenance} here"
             violations.append(Violation(f"{name}/{IDENTITY_PATH}", what))
             continue
@@ -216,10 +216,12 @@ def _kinds(dataset: Dataset) -> set[str]:
     return {str(source.get("kind")) for source in dataset.identity.sources}
 
 
-def _suite_version(simulator: str, provenance: Mapping[str, Any]) -> object:
+def suite_version(simulator: str, provenance: Mapping[str, Any]) -> object:
     """Return the version of the episodes: see `Simulator.versions`."""
-    declared = simulator_class(simulator)
-    return provenance.get("versions", {}).get(declared.name or declared.__name__)
+    declared, versions = simulator_class(simulator), provenance.get("versions")
+    if not isinstance(versions, Mapping):
+        return None
+    return versions.get(declared.name or declared.__name__)
 
 
 def _differences(dataset: PlayedDataset, record: EpisodeRecord) -> Iterator[str]:

@@ -83,7 +83,8 @@ def verify(
     list everything that is wrong, by episode and frame.
 
     With --audit, a leak fails as well. A policy can use lesson length, goal and first live
-    observation without any memory: each episode is guessed from the others of its family.
+    observation without any memory: each episode is guessed from the others of its family. Queries
+    of days are also guessed from the clock and the place of their lessons.
 
     Examples:
     ```
@@ -281,6 +282,11 @@ def _open(buffer_set: str) -> "tuple[BufferSet | None, MissingFileError | None]"
 def _audit(opened: "BufferSet", report: dict[str, Any], *, as_json: bool) -> bool:
     """Add the audit and the shortcuts to the report, or print them; return whether it leaks."""
     from robomme_interference_data.build_dataset.verify.audit import audit_buffer_set
+    from robomme_interference_data.evaluate.day_shortcuts import (
+        day_cues,
+        day_shortcut_table,
+        day_shortcuts,
+    )
     from robomme_interference_data.evaluate.shortcuts import shortcut_table
     from robomme_interference_data.schema.codec import to_dict
     from robomme_interference_data.viz.tables import tables_text
@@ -289,10 +295,15 @@ def _audit(opened: "BufferSet", report: dict[str, Any], *, as_json: bool) -> boo
     shortcuts = _shortcuts(opened)
     report["audit"] = audit.as_dict()
     report["shortcuts"] = [to_dict(shortcut) for shortcut in shortcuts]
+    in_days = [*day_shortcuts(day_cues(opened))]
+    if in_days:
+        report["day_shortcuts"] = [to_dict(shortcut) for shortcut in in_days]
     if not as_json:
         tables = [*audit.tables()]
         if shortcuts:
             tables.append(shortcut_table(shortcuts, f"Shortcuts in {opened.name}"))
+        if in_days:
+            tables.append(day_shortcut_table(in_days, f"Shortcuts in the days of {opened.name}"))
         echo(tables_text(tables) + "\n")
         for leak in audit.leaks:
             echo(f"LEAK, {leak.kind}: {leak.where}")

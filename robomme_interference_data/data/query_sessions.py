@@ -15,16 +15,15 @@ from robomme_interference_data.constants import (
     DISTRACTORS,
     RAW_DISTRACTORS,
 )
-from robomme_interference_data.errors import (
-    BuildError,
-    FormatError,
-    HashMismatchError,
-    SourceError,
-    named,
-)
+from robomme_interference_data.errors import BuildError, FormatError, HashMismatchError, SourceError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import Condition, parse_condition
-from robomme_interference_data.schema.draw import UnitPool, check_units, only_in_days
+from robomme_interference_data.schema.draw import (
+    UnitPool,
+    check_units,
+    only_in_days,
+    too_few_follow,
+)
 from robomme_interference_data.schema.manifest import BufferManifest, SessionEntry, layout_sessions
 from robomme_interference_data.schema.records import Day, DayQuery, DaySpan, EpisodeRecord
 from robomme_interference_data.schema.sampling import lesson_frames, lesson_share
@@ -212,11 +211,7 @@ class QuerySessions:
         tasks = [span for span in day.spans if span.part != "transition"]
         further = len(tasks) - 1 - asked.task
         if k > further:
-            raise BuildError(
-                f"{further} tasks of {record.episode_id} follow after {query} can be asked; a "
-                f"condition needs {k}",
-                f"Choose {named('conditions')} with fewer, or build longer days.",
-            )
+            raise too_few_follow(query, record.episode_id, further, k)
         stop = tasks[asked.task + k].stop
         dataset = self._source.datasets[DAYS]
         return [

@@ -22,8 +22,9 @@ Rule version 1, for day d of n tasks:
 
 import hashlib
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 
 from robomme_interference_data.constants import DIFFICULTIES, FAMILIES
 from robomme_interference_data.errors import InvalidIdError
@@ -42,8 +43,11 @@ DEFAULT_TASKS = 30
 
 _CYCLE = ("recall", "update", "order", "absent", "recall", "update")
 _CYCLE_IN_PIECES = ("several", "recall", "several", "absent", "several", "order")
-_IN_PIECES = ("PatternLock", "RouteStick")
+IN_PIECES = ("PatternLock", "RouteStick")
 """Families of which neither piece of a lesson shows the whole answer."""
+
+LEAST_FRAMES = {"lesson": 150, "first": 50, "second": 50, "idle": 32}
+"""Fewest frames of a task by its part, on the embedded simulator: others do not play days."""
 
 _LESSONS = {"recall": 1, "several": 2, "update": 2, "order-first": 2, "order-last": 2, "absent": 0}
 """Tasks that are played for a query."""
@@ -151,16 +155,11 @@ def plan_day(
         others: Episodes for tasks that no query asks about, in any order.
         other_answer: Returns the number of another answer of an episode; see `Simulator`.
     """
-    count, early = day_tasks(day), _early(day)
-    places = sorted(range(early), key=lambda place: _lot(day, "place", place))
+    count, placed = day_tasks(day), _places(day)
     tasks: dict[int, tuple[EpisodeId | None, str]] = {}
-    queries = []
-    for query in queries_of(day):
-        lessons = _lessons(query, other_answer)
-        own = sorted(places[len(tasks) : len(tasks) + len(lessons)])
-        tasks |= dict(zip(own, lessons, strict=True))
-        asked = own[-1] if own else _asked_without(day, query)
-        queries.append(DayQuery(query, asked))
+    for query, places in placed.items():
+        tasks |= dict(zip(places, _lessons(query, other_answer), strict=True))
+    queries = [DayQuery(query, _asked(day, query, places)) for query, places in placed.items()]
     asked_about = {query.episode for query in queries}
     fill = _fill(day, (episode for episode in others if episode not in asked_about))
     for place in range(count):
@@ -169,19 +168,56 @@ def plan_day(
     return DayPlan(
         day,
         tuple(
-            PlannedTask(
-                *tasks[place],
-                _look(day, place),
-                _TRANSITION[_lot(day, "transition", place) % len(_TRANSITION)],
-            )
+            PlannedTask(*tasks[place], _look(day, place), _transition(day, place))
             for place in range(count)
         ),
         tuple(sorted(queries, key=lambda query: query.episode)),
     )
 
 
+def least_day(day: EpisodeId, query: EpisodeId) -> tuple[int, list[tuple[str, int]]]:
+    """Return what is certain about the sessions of a query's day before it is played.
+
+    Returns:
+        The number of the task after which the query can be asked, and a session for each span of
+        the day in order: its role, and its least number of frames. A lesson may be a contradicting
+        one.
+    """
+    placed = _places(day)
+    parts: dict[int, str] = {}
+    for known, places in placed.items():
+        of_lessons = (part for _, part in _lessons(known, lambda episode: None))
+        parts |= dict(zip(places, of_lessons, strict=True))
+    others = [place for place in range(day_tasks(day)) if place not in parts]
+    parts |= {
+        place: "idle" if number % 5 == 0 else "lesson" for number, place in enumerate(others, 1)
+    }
+    sessions = []
+    for place in range(day_tasks(day)):
+        role = "lesson" if place in placed[query] else "distractor"
+        sessions.append(("transition", _transition(day, place)))
+        sessions.append((role, LEAST_FRAMES[parts[place]]))
+    return _asked(day, query, placed[query]), sessions
+
+
+def _places(day: EpisodeId) -> dict[EpisodeId, list[int]]:
+    """Return the places of each query's lessons among the tasks of a day, in order."""
+    drawn = iter(sorted(range(_early(day)), key=lambda place: _lot(day, "place", place)))
+    return {query: sorted(islice(drawn, _LESSONS[ability_of(query)])) for query in queries_of(day)}
+
+
+def _asked(day: EpisodeId, query: EpisodeId, places: Sequence[int]) -> int:
+    """Return the task after which a query can be asked, given the places of its lessons."""
+    return places[-1] if places else _asked_without(day, query)
+
+
+def _transition(day: EpisodeId, place: int) -> int:
+    """Return the frames of the transition before a task."""
+    return _TRANSITION[_lot(day, "transition", place) % len(_TRANSITION)]
+
+
 def _cycle(query: EpisodeId) -> tuple[str, ...]:
-    return _CYCLE_IN_PIECES if query.family in _IN_PIECES else _CYCLE
+    return _CYCLE_IN_PIECES if query.family in IN_PIECES else _CYCLE
 
 
 def _asked_without(day: EpisodeId, query: EpisodeId) -> int:

@@ -24,17 +24,18 @@ Rule version 1, for a query of family F and index i:
 
 import hashlib
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import islice
-from typing import Any
+from typing import Any, NamedTuple
 
-from robomme_interference_data.constants import DISTRACTORS, FAMILIES, RULE_VERSION
-from robomme_interference_data.errors import BuildError, InvalidOptionError, named
+from robomme_interference_data.constants import DISTRACTORS, FAMILIES, MAX_STEPS, RULE_VERSION
+from robomme_interference_data.errors import BuildError, InvalidOptionError, counted, named
 from robomme_interference_data.ids import EpisodeId
 
 from .conditions import Condition
+from .days import day_tasks, least_day
 
 
 class UnitPool:
@@ -138,25 +139,65 @@ def check_units(
     queries: Iterable[EpisodeId],
     conditions: Iterable[Condition],
     absent: Collection[EpisodeId] = (),
+    days: Mapping[EpisodeId, EpisodeId] | None = None,
+    position_limit: int | None = None,
 ) -> None:
     """Check that a pool has the units of all buffers, and that every query has what it needs.
+
+    It shows before anything is built, of days as far as their plan decides on it.
 
     Args:
         pool: The units.
         queries: The query episodes.
         conditions: The conditions.
         absent: Those of them that no lesson is shown for.
+        days: The days of queries of days.
+        position_limit: Most positions of history and rollout; None for no limit.
 
     Raises:
         BuildError: The pool has too few units; the message says how many. Or a condition needs the
-            lesson of one of `absent`.
+            lesson of one of `absent`, or more tasks of a day than follow.
+        InvalidOptionError: A query's day is longer than the limit.
     """
-    chosen = list(conditions)
+    chosen, days = list(conditions), days or {}
     # Queries of a family draw alike.
     checked = {episode.family: episode for episode in sorted(queries)}
-    for query in [*checked.values(), *sorted(absent)]:
+    # The last one first, so that the error says what all others have, too.
+    in_days = sorted(days, key=lambda query: least_day(days[query], query)[0], reverse=True)
+    for query in [*in_days, *checked.values(), *sorted(absent)]:
         for condition in chosen:
-            condition.sessions(_UnreadSessions(query, pool, query in absent))
+            provider = _UnreadSessions(query, pool, query in absent, days.get(query))
+            frames = sum(session.num_frames for session in condition.sessions(provider))
+            if position_limit is not None and frames + MAX_STEPS > position_limit:
+                what = f"{query} under {condition}"
+                raise too_long(what, f"at least {frames}", frames, position_limit)
+
+
+def too_few_follow(query: EpisodeId, day: EpisodeId, further: int, k: int) -> BuildError:
+    """Return the error about a condition that needs more tasks of a day than follow."""
+    return BuildError(
+        f"{counted(further, 'task')} of {day} follow after {query} can be asked; a condition needs "
+        f"{k}",
+        f"Choose {named('conditions')} with at most that many, such as day-k{further}, or build "
+        "longer days.",
+    )
+
+
+def too_long(what: str, shown: str, frames: int, limit: int) -> InvalidOptionError:
+    """Return the error about a history that, with its rollout, exceeds a position limit (rule 8).
+
+    Args:
+        what: The buffer.
+        shown: Its number of frames, in words.
+        frames: The number of frames, of which it may have more.
+        limit: The limit.
+    """
+    return InvalidOptionError(
+        f"{what} needs {frames + MAX_STEPS} positions ({shown} history frames + {MAX_STEPS} "
+        f"steps); the limit is {limit}",
+        f"Leave out the condition, or set {named('position_limit', 'none')} for systems without a "
+        "limit.",
+    )
 
 
 def only_in_days(query: EpisodeId) -> BuildError:
@@ -177,23 +218,37 @@ class _UnreadSessions:
     query: EpisodeId
     pool: UnitPool
     absent: bool
+    in_day: EpisodeId | None
 
     def lesson(self, part: str = "lesson") -> Any:
         if self.absent:
             raise only_in_days(self.query)
-        return self.query
+        return _Unread("lesson")
 
     def contradiction(self) -> Any:
-        return self.query
+        return _Unread("contradiction")
 
     def units(self, k: int, dataset: str = DISTRACTORS) -> Sequence[Any]:
-        return self.pool.draw(self.query, k)
+        return [_Unread("distractor") for _ in self.pool.draw(self.query, k)]
 
     def own_units(self, k: int) -> Sequence[Any]:
-        return self.pool.draw_own(self.query, k)
+        return [_Unread("distractor") for _ in self.pool.draw_own(self.query, k)]
 
     def day(self, k: int) -> Sequence[Any]:
-        return ()  # how many tasks follow is checked when the buffers are planned
+        if self.in_day is None:
+            return ()
+        asked, sessions = least_day(self.in_day, self.query)
+        further = day_tasks(self.in_day) - 1 - asked
+        if k > further:
+            raise too_few_follow(self.query, self.in_day, further, k)
+        return [_Unread(*session) for session in sessions[: 2 * (asked + k + 1)]]
+
+
+class _Unread(NamedTuple):
+    """A session that is not read yet, with the number of frames that is certain."""
+
+    role: str
+    num_frames: int = 0
 
 
 def _hash(seed: int, *parts: str) -> bytes:

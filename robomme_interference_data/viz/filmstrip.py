@@ -23,8 +23,14 @@ LESSON_COLOR = Hue.VERMILION
 COLORS = (Hue.SKY, Hue.ORANGE, Hue.GREEN, Hue.PINK, Hue.BLUE, Hue.YELLOW, "#999999", "#000000")
 """Of the other sessions."""
 
-_NO_FAMILY = {"lesson": LESSON_COLOR, "transition": "#dddddd"}
-"""Colors by role of sessions that have none of their family."""
+CONTRADICTION_COLOR = "#7F3300"
+"""A dark one of the lesson's: both show the query's scene, and distractors may have its family."""
+
+_BY_ROLE = {"lesson": LESSON_COLOR, "contradiction": CONTRADICTION_COLOR, "transition": "#dddddd"}
+"""Colors of roles; sessions of others have one of their family."""
+
+_KEY = {"contradiction": "contradicting lesson"}
+"""Words for roles in the key of colors, where they differ."""
 
 # Inches.
 _WIDTH = 7.2  # text width of a two-column page
@@ -77,14 +83,14 @@ def arrange(frames: Sequence[int]) -> tuple[int, list[Block]]:
 
 
 def session_colors(sessions: Sequence[Session]) -> list[str]:
-    """Return a color for each session: one for the lesson, and one for each other family.
+    """Return a color for each session: of the lesson, of a contradicting one, of each other family.
 
     Families get colors in order of appearance, so they keep them when k grows. The transitions of a
     day are pale, so that its tasks stand out.
     """
-    families = dict.fromkeys(s.family for s in sessions if s.role not in _NO_FAMILY)
+    families = dict.fromkeys(s.family for s in sessions if s.role not in _BY_ROLE)
     by_family = {family: COLORS[n % len(COLORS)] for n, family in enumerate(families)}
-    return [_NO_FAMILY.get(s.role) or by_family[s.family] for s in sessions]
+    return [_BY_ROLE.get(s.role) or by_family[s.family] for s in sessions]
 
 
 def round_step(frames: int, most: int) -> int:
@@ -254,3 +260,18 @@ def _draw_timeline(page: Page, buffer: "Buffer", top: float) -> None:
         page.tick(x, bar + _BAR, bar + _BAR + 0.04)
         page.text(x, bar + _BAR + 0.06, str(index), _NUMBER, color=_GRAY)
     page.text(_MARGIN + width / 2, bar + _BAR + 0.19, "frame in the buffer", _TEXT, color=_GRAY)
+    _draw_key(page, buffer, bar + _BAR + 0.36)
+
+
+def _draw_key(page: Page, buffer: "Buffer", top: float) -> None:
+    """Name the colors of roles, if there are others than the lesson's, which stands out."""
+    found = {session.role for session in buffer.sessions}
+    roles = [role for role in _BY_ROLE if role in found]
+    if not {*roles} - {"lesson"}:
+        return
+    left = _MARGIN
+    for role in roles:
+        name = _KEY.get(role, role)
+        page.box(left, top, 0.12, 0.1, fill=_BY_ROLE[role], edge=_GRAY, line=0.5)
+        page.text(left + 0.17, top - 0.01, name, _NUMBER, align="left")
+        left += 0.35 + page.text_width(name, _NUMBER)

@@ -21,10 +21,11 @@ from support.days import CONDITIONS, IDLE, build_days, lesson, plan_of, playing_
 from support.hub_server import HubServer
 from support.messages import raises
 from support.publishing import UNITS, plain_cards, publish
-from support.verifying import expect
+from support.verifying import expect, first_changed
 
 from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.build_dataset.dataset.build import build_dataset
+from robomme_interference_data.build_dataset.sources import day as day_source
 from robomme_interference_data.cards.dataset_facts import buffer_set_facts
 from robomme_interference_data.cards.publication import Publication
 from robomme_interference_data.cards.render import card_text
@@ -32,6 +33,7 @@ from robomme_interference_data.constants import ABILITIES
 from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
 from robomme_interference_data.evaluate.ceiling import ceiling
 from robomme_interference_data.evaluate.run.config import CeilingConfig
+from robomme_interference_data.evaluate.day_shortcuts import day_cues
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.schema.records import DaySpan
@@ -121,6 +123,18 @@ def test_lerobot_opens_the_days(root: Path) -> None:
     assert item["task"] == "do the 8 tasks of the day"
 
 
+def test_holding_still_does_not_outweigh_other_executions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(day_source, "STILL_FRAMES", 2)
+    with playing_days():
+        build_dataset(plan_of("executions"), tmp_path / "executions", Serial(), QUIET)
+    records = dataset(tmp_path, "executions").records()
+    lengths = {str(record.episode_id): record.length for record in records}
+    assert lengths.pop(ABSENT) == lengths.pop("PatternLock/test/6") == 2
+    assert len(lengths) == 5 and {*lengths.values()} == {3}
+
+
 # --- buffers ------------------------------------------------------------------------------------
 
 
@@ -191,6 +205,22 @@ def test_abilities_have_ceilings(root: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert found["all"] == (7, 1.0)
 
 
+def test_what_a_policy_sees_of_a_query_without_a_memory(root: Path, run: Any) -> None:
+    found = {
+        one.condition: one
+        for one in day_cues(load_buffer_set(root))
+        if (one.family, one.ability) == ("VideoUnmask", "update")
+    }
+    whole, cut, short = (found[name] for name in ("day-k2", "day-cut-k2", "day-k0"))
+    assert whole.task == 2 and short.delay == 0
+    assert cut.length == 5 * 6 and cut.delay == 2 * 6  # of five tasks, without transitions
+    assert cut.clock == whole.clock == whole.length == short.length + whole.delay
+    code, out, _ = run("verify", root, "--audit", "--json")
+    report = json.loads(out)
+    assert code == 0 and not report["violations"]
+    assert {row["condition"] for row in report["day_shortcuts"]} == {*found}
+
+
 def test_its_card_counts_the_days(root: Path) -> None:
     card = card_text(buffer_set_facts(load_buffer_set(root)), Publication("a/b", "1.0.0"))
     assert "days" in card and "day-cut-k2" in card
@@ -206,6 +236,26 @@ def test_no_lesson_without_one_before_anything_is_built(tmp_path: Path, run: Any
         *("--unit-episodes", "0", "--conditions", "k0,day-k0"),
     )
     assert code == 1 and ABSENT in err and "day-k0" in err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        # Its last lesson is task 5 of 0 to 7.
+        (("--conditions", "no-history,day-k3", "--position-limit", "none"), "day-k2"),
+        (("--conditions", "day-k2", "--position-limit", "2000"), "--position-limit none"),
+    ],
+)
+def test_what_no_day_holds_before_anything_is_built(
+    options: tuple[str, ...], expected: str, tmp_path: Path, run: Any
+) -> None:
+    out = tmp_path / "buffers"
+    code, _, err = run(
+        *("build", out, "--source", "tabletop-day:8", "--split", "test", "--episodes", "1"),
+        *("--unit-episodes", "0", *options),
+    )
+    assert code == 1 and "VideoPlaceButton/test/1" in err and expected in err
     assert not out.exists()
 
 
@@ -276,6 +326,28 @@ def too_late(day: dict[str, Any]) -> dict[str, Any]:
     return day
 
 
+def usual_look(day: dict[str, Any]) -> dict[str, Any]:
+    day["spans"][0]["shift"] = "none"
+    return day
+
+
+def longer_transition(day: dict[str, Any]) -> dict[str, Any]:
+    transition, task, *_ = day["spans"]
+    transition["stop"] += 1
+    task["start"] += 1
+    return day
+
+
+def without_an_end(day: dict[str, Any]) -> dict[str, Any]:
+    del day["spans"][-2:]
+    return day
+
+
+def sooner(day: dict[str, Any]) -> dict[str, Any]:
+    day["queries"][0]["task"] -= 1
+    return day
+
+
 @pytest.mark.parametrize(
     ("change", "pattern"),
     [
@@ -283,12 +355,28 @@ def too_late(day: dict[str, Any]) -> dict[str, Any]:
         (exchanged, "days Day8/test/1: frames 0 to [0-9]+ do not have the recorded SHA-256"),
         (outside, "days Day8/test/1: evidence of .* is outside of its frames"),
         (too_late, "days Day8/test/1: VideoPlaceOrder/test/1 is asked after task 8 of 8"),
+        (usual_look, "days Day8/test/1: a span is .*'none'.* at 0; the plan gives .*'light:2'"),
+        (longer_transition, "days Day8/test/1: a span is {'frames': .* at 0; the plan gives"),
+        (without_an_end, "days Day8/test/1: has 14 spans; the plan gives 16"),
+        (sooner, "days Day8/test/1: queries are {'task': 2} at 0; the plan gives {'task': 3}"),
         (lambda day: None, "days Day8/test/1: has no tasks"),
     ],
 )
 def test_a_changed_day_is_found(own: Path, change: Any, pattern: str) -> None:
     changed_day(own, change)
     expect(own, pattern, decode=change is exchanged)
+
+
+def test_another_ability_is_found(own: Path) -> None:
+    for path in ("interference.parquet", "episodes/chunk-000/file-000.parquet"):
+        edit(own / "demonstrations/meta" / path, first_changed("ability", "recall"))
+    expect(own, f"demonstrations {ABSENT}: ability is recall; the plan gives absent")
+
+
+def test_days_of_another_version_are_not_planned_again(own: Path) -> None:
+    path = own / "days/meta/interference.json"
+    path.write_text(path.read_text().replace('"tabletop-day": "1"', '"tabletop-day": "0"'))
+    expect(own, "days/meta/interference.json: .*; days of these cannot be planned here")
 
 
 def test_a_buffer_with_another_role_is_found(own: Path) -> None:

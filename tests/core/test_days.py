@@ -14,12 +14,14 @@ from robomme_interference_data.constants import ABILITIES, FAMILIES
 from robomme_interference_data.errors import InvalidIdError
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.days import (
+    LEAST_FRAMES,
     TASKS,
     DayPlan,
     ability_of,
     day_id,
     day_tasks,
     goal_in_day,
+    least_day,
     plan_day,
     queries_of,
     query_indices,
@@ -179,6 +181,21 @@ def test_queries_without_a_lesson_are_asked_as_late_as_others() -> None:
             late[ability_of(query.episode) == "absent"].append(query.task)
     absent, others = (sum(late[kind]) / len(late[kind]) for kind in (True, False))
     assert abs(absent - others) < 1  # of 23 tasks; drawn uniformly, they would differ by 2.4
+
+
+@given(st.sampled_from(TASKS), st.integers(0, 30))
+def test_what_is_certain_of_a_day_before_it_is_played(tasks: int, index: int) -> None:
+    planned = plan(tasks, index)
+    frames = [
+        count for task in planned.tasks for count in (task.transition, LEAST_FRAMES[task.part])
+    ]
+    for query in planned.queries:
+        asked, sessions = least_day(planned.day, query.episode)
+        assert asked == query.task and [count for _, count in sessions] == frames
+        for task, (role, _) in zip(planned.tasks, sessions[1::2], strict=True):
+            own = task.episode is not None and task.episode.scene == query.episode
+            assert role == ("lesson" if own else "distractor")
+        assert {role for role, _ in sessions[::2]} == {"transition"}
 
 
 def test_other_tasks_are_never_queries() -> None:

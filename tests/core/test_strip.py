@@ -21,7 +21,7 @@ from support.retrieval import remade
 from robomme_interference_data import Buffer, load_buffer, load_buffer_set
 from robomme_interference_data.errors import InvalidOptionError, UnknownNameError
 from robomme_interference_data.schema.sampling import spread
-from robomme_interference_data.viz.filmstrip import Block, arrange, draw_strip
+from robomme_interference_data.viz.filmstrip import Block, arrange, draw_strip, session_colors
 
 pytest.importorskip("matplotlib")
 
@@ -105,11 +105,24 @@ def test_texts_describe_the_buffer(strip: Path, buffer: Buffer) -> None:
     # 48 lesson frames of 144: samples are j · 144 // 31, so 0 to 10 of 32, 34%.
     share = "an even 32-frame sample holds 34% lesson"
     assert f"144 history frames = 48 lesson + 96 distractor;  {share}" in found
+    assert "lesson" not in found  # no key of colors: it stands out
     assert "0  LESSON" in found and "what the robot sees now" in found
     assert found[-2:] == ["144", "first live observation"]
     for number, session in enumerate(buffer.sessions):
         assert session.family in found and str(session.source) in found
         assert number == 0 or f"{number}  distractor" in found
+
+
+def test_a_contradicting_lesson_and_a_unit_of_its_family(
+    tiny_buffers: Path, tmp_path: Path
+) -> None:
+    lesson, old, unit, _ = load_buffer_set(tiny_buffers).manifest(QUERIES[0], "k3").sessions
+    entries = [replace(old, role="contradiction"), replace(unit, family=old.family), lesson]
+    buffer = remade(tiny_buffers, entries)
+    assert len({*session_colors(buffer.sessions)}) == 3
+    draw_strip(buffer, tmp_path / "strip.svg")
+    found = labels(tmp_path / "strip.svg")
+    assert found.index("lesson") + 1 == found.index("contradicting lesson")
 
 
 def test_shows_the_right_frames_in_order_and_the_live_one_last(strip: Path, buffer: Buffer) -> None:
