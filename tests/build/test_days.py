@@ -32,8 +32,8 @@ from robomme_interference_data.cards.render import card_text
 from robomme_interference_data.constants import ABILITIES
 from robomme_interference_data.errors import BuildError, InvalidOptionError, SourceError
 from robomme_interference_data.evaluate.ceiling import ceiling
-from robomme_interference_data.evaluate.run.config import CeilingConfig
 from robomme_interference_data.evaluate.day_shortcuts import day_cues
+from robomme_interference_data.evaluate.run.config import CeilingConfig
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.schema.records import DaySpan
