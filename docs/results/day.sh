@@ -19,7 +19,7 @@ robomme-interference build test-days --source tabletop-day --split test --episod
     --unit-episodes 0-3 --cameras front --position-limit none --conditions $conditions
 robomme-interference build test-days --only questions
 robomme-interference index test-days --encoder thumbnail
-robomme-interference verify test-days --audit
+robomme-interference verify test-days --audit --json > verify.json
 
 declare -A memories=(
     [full]=full [framesamp-32]=framesamp:32 [framesamp-128]=framesamp:128 [window-60s]=window:60@2
