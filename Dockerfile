@@ -26,4 +26,4 @@ COPY . .
 RUN scripts/system_packages.sh vulkan chromium
 RUN scripts/setup.sh
 ENV PATH=/opt/robomme-interference/.venv/bin:$PATH
-CMD ["bash"]
+CMD ["robomme-interference", "doctor"]

@@ -121,7 +121,7 @@ def published_urls(index: str, name: str) -> set[str]:
 
 
 def make_images(name: str, version: str) -> None:
-    """Build the images and start one; without Docker, run the scripts that they are made by."""
+    """Build and start the images; without Docker, run the scripts that they are made by."""
     if not has_docker():
         say("no Docker here: the scripts that make the images run on this machine instead")
         for command in run_lines(ROOT / "Dockerfile"):
@@ -131,7 +131,7 @@ def make_images(name: str, version: str) -> None:
         tag = f"{name}:{version}-{target}"
         docker = ["docker", "build", "--target", target, "--tag", tag, str(ROOT)]
         subprocess.run(docker, check=True)
-    subprocess.run(["docker", "run", "--rm", f"{name}:{version}-light"], check=True)
+        subprocess.run(["docker", "run", "--rm", tag], check=True)  # it prints what works in it
 
 
 def has_docker() -> bool:

@@ -49,7 +49,9 @@ class PackageIndex(LoopbackServer):
 
     def add(self, name: str, owner: str, *files: Path) -> None:
         """Register a name with files, as if they had been uploaded before."""
-        self.projects[normalized(name)] = Project(owner, {one.name: one.read_bytes() for one in files})
+        self.projects[normalized(name)] = Project(
+            owner, {one.name: one.read_bytes() for one in files}
+        )
 
     def answer(self, request: Request) -> Answer:
         """Return what the index answers."""

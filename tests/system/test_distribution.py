@@ -1,4 +1,4 @@
-"""What is published of the package: sdist and wheel; `make bare` uploads, installs and uses them."""
+"""What is published of the package: sdist and wheel, which `make bare` uses."""
 
 import shutil
 import subprocess

@@ -151,19 +151,10 @@ def test_a_free_name_is_no_problem(release: Any, index: PackageIndex) -> None:
 
 @pytest.mark.parametrize(
     ("published", "ours", "says"),
-    [
-        ("0.0.1", True, None),
-        (VERSION, True, "versions never change"),
-        ("0.0.1", False, "is taken"),
-    ],
+    [("0.0.1", True, None), (VERSION, True, "versions never change"), ("0.0.1", False, "is taken")],
 )
 def test_a_name_is_taken_by_others_and_a_version_by_us(
-    release: Any,
-    index: PackageIndex,
-    tmp_path: Path,
-    published: str,
-    ours: bool,
-    says: str | None,
+    release: Any, index: PackageIndex, tmp_path: Path, published: str, ours: bool, says: str | None
 ) -> None:
     url = PROJECT["urls"]["Repository"] if ours else "https://example.com/somebody-else"
     index.add(NAME, "somebody", wheel(tmp_path, published, url))
@@ -229,8 +220,9 @@ def test_images_are_built_where_docker_answers(
     release.make_images("name", "1.0.0")
     assert (tmp_path / "calls").read_text().splitlines()[1:] == [
         "build --target light --tag name:1.0.0-light",
-        "build --target full --tag name:1.0.0-full",
         "run --rm name:1.0.0-light  ",
+        "build --target full --tag name:1.0.0-full",
+        "run --rm name:1.0.0-full  ",
     ]
 
 
