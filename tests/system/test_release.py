@@ -289,3 +289,13 @@ def test_a_vulnerability_is_reported_to_this_repository_in_private() -> None:
     config = yaml.safe_load((ROOT / ".github/ISSUE_TEMPLATE/config.yml").read_text("utf-8"))
     assert config["blank_issues_enabled"] is False
     assert [link["url"] for link in config["contact_links"]] == [f"{repository}/security/policy"]
+
+
+def test_the_readmes_badges_lead_to_files_of_this_repository() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    owner_and_name = PROJECT["urls"]["Repository"].removeprefix("https://github.com/")
+    workflows = re.findall(rf"{owner_and_name}/actions/workflows/([\w.]+)", text)
+    notebooks = re.findall(rf"{owner_and_name}/blob/main/(\S+?)\)", text)
+    assert workflows and notebooks
+    files = [*(f".github/workflows/{name}" for name in workflows), *notebooks]
+    assert [name for name in files if not (ROOT / name).is_file()] == []
