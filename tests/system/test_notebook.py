@@ -74,7 +74,7 @@ def test_the_notebook_for_colab_has_the_cells_of_the_tutorial() -> None:
     assert script["updated"]() == COLAB.read_text(encoding="utf-8")
     tutorial = {cell["id"] for cell in script["read"](script["TUTORIAL"])["cells"]}
     shared = [one["id"] for one in script["read"](COLAB)["cells"] if one["id"] in tutorial]
-    assert len(shared) == 9
+    assert len(shared) == 7
 
 
 def test_without_matplotlib_a_buffer_is_text_and_the_extra_is_named(
