@@ -4,6 +4,7 @@ import json
 import os
 import runpy
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from IPython.core.interactiveshell import InteractiveShell
 from support.buffer_sets import GOLDEN
 from support.hub import push_buffer_set
 
-from robomme_interference_data import load_buffer
+from robomme_interference_data import load_buffer, load_buffer_set
 from robomme_interference_data.notebooks import register
 
 ROOT = Path(__file__).parents[2]
@@ -27,46 +28,66 @@ def shell() -> InteractiveShell:
     return shell
 
 
-def outputs(shell: InteractiveShell, notebook: Path, replaced: str = "", by: str = "") -> list[str]:
-    """Run a notebook; return the formats in which its cells show their values."""
+def code_cells(notebook: Path) -> dict[str, str]:
+    """The code of a notebook's cells by their ids."""
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    return {
+        cell.get("id", str(number)): "".join(cell["source"])
+        for number, cell in enumerate(cells)
+        if cell["cell_type"] == "code"
+    }
+
+
+def outputs(shell: InteractiveShell, codes: Iterable[str]) -> list[str]:
+    """Run code cell by cell; return the formats in which cells show their values."""
     shown = []
-    for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"]:
-        if cell["cell_type"] == "code":
-            result = shell.run_cell("".join(cell["source"]).replace(replaced, by))
-            result.raise_error()
-            if result.result is not None:
-                formats, _ = shell.display_formatter.format(result.result)
-                shown.append(" ".join(sorted(formats)))
+    for code in codes:
+        result = shell.run_cell(code)
+        result.raise_error()
+        if result.result is not None:
+            formats, _ = shell.display_formatter.format(result.result)
+            shown.append(" ".join(sorted(formats)))
     return shown
 
 
 @pytest.mark.slow
 def test_the_example_runs(shell: InteractiveShell, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("BUFFER_SET", str(GOLDEN))
-    assert {"text/html text/plain", "image/png text/plain"} <= {*outputs(shell, NOTEBOOK)}
+    shown = outputs(shell, code_cells(NOTEBOOK).values())
+    assert {"text/html text/plain", "image/png text/plain"} <= {*shown}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("buffer_set", ["", "namespace/name@data-1.0.0"])
-def test_the_notebook_for_colab_runs(
-    shell: InteractiveShell,
-    hub: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    buffer_set: str,
-) -> None:
-    """Offline, beside a clone: with the repository's sample, and with a set from the Hub."""
-    push_buffer_set(hub, GOLDEN, tmp_path / "work", "namespace/name")
+@pytest.fixture
+def beside_a_clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder as it is on Colab when the package has been installed."""
     (tmp_path / "robomme-interference-data").symlink_to(ROOT)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("BUFFER_SET", "")  # the notebook sets it
+    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_the_notebook_for_colab_runs(shell: InteractiveShell, beside_a_clone: Path) -> None:
+    """Offline, with the repository's sample."""
+    shown = outputs(shell, code_cells(COLAB).values())
+    assert shown == ["image/png text/plain"] * 2  # the film strip, and the figure of the score
+    assert (beside_a_clone / "tutorial" / "score" / "report.html").is_file()
+
+
+@pytest.mark.slow
+def test_the_notebook_for_colab_fetches_a_published_set(
+    shell: InteractiveShell, beside_a_clone: Path, hub: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    push_buffer_set(hub, GOLDEN, beside_a_clone / "work", "namespace/name")
     monkeypatch.setenv("HF_ENDPOINT", hub.endpoint)
     monkeypatch.setenv("HF_HUB_OFFLINE", "0")
-    monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
-    empty = 'os.environ["BUFFER_SET"] = ""'
-    shown = outputs(shell, COLAB, empty, empty.replace('""', f'"{buffer_set}"'))
-    assert shown == ["image/png text/plain"] * 2  # the film strip, and the figure of the score
-    assert (tmp_path / "tutorial" / "score" / "report.html").is_file()
+    cells = code_cells(COLAB)
+    named = cells["colab-3"].replace('= ""', '= "namespace/name@data-1.0.0"')
+    assert named != cells["colab-3"]
+    outputs(shell, (named, cells["colab-4"]))
+    fetched = load_buffer_set(beside_a_clone / "tutorial" / "buffers")
+    assert fetched.episode_ids == load_buffer_set(GOLDEN).episode_ids
 
 
 def test_the_notebook_for_colab_has_the_cells_of_the_tutorial() -> None:
