@@ -26,6 +26,9 @@ from distribution import ROOT, build, configured_index
 IMAGES = ("light", "full")
 """Targets of the Dockerfile."""
 
+NOTES = "build/release-notes.md"
+"""Where the changelog's newest section is written."""
+
 
 def main() -> None:
     """Run every step; exit with an error at the first one that fails."""
@@ -46,6 +49,7 @@ def main() -> None:
 
     subprocess.run(["make", "docs"], cwd=ROOT, check=True)
     make_images(project["name"], version)
+    (ROOT / NOTES).write_text(newest_section(ROOT)[1], encoding="utf-8")
     print(*remaining(project["name"], version), sep="\n")
 
 
@@ -64,9 +68,7 @@ def disagreements(root: Path, version: str) -> Iterator[str]:
     cited = yaml.safe_load((root / "CITATION.cff").read_text(encoding="utf-8"))["version"]
     if str(cited) != version:
         yield f"CITATION.cff has version {cited}, not {version}: set `version`"
-    changelog = (root / "CHANGELOG.md").read_text(encoding="utf-8")
-    headings = re.findall(r"^## (.+)$", changelog, flags=re.MULTILINE)
-    newest = headings[0] if headings else "nothing"
+    newest, _ = newest_section(root)
     if newest.split()[0] != version:
         yield f"CHANGELOG.md begins with {newest}, not {version}: rename its first section"
     changed = git(root, "status", "--porcelain").splitlines()
@@ -77,6 +79,14 @@ def disagreements(root: Path, version: str) -> Iterator[str]:
     # On a tag that was pushed, the workflow `publish` runs this.
     if tagged and tagged != git(root, "rev-parse", "HEAD"):
         yield f"the tag v{version} is on another commit ({tagged[:8]}): raise the version"
+
+
+def newest_section(root: Path) -> tuple[str, str]:
+    """Return the heading and the text of the changelog's first section."""
+    changelog = (root / "CHANGELOG.md").read_text(encoding="utf-8")
+    _, section, *_ = re.split(r"^## ", changelog, flags=re.MULTILINE)
+    heading, _, text = section.partition("\n")
+    return heading, text.strip() + "\n"
 
 
 def git(root: Path, *arguments: str) -> str:
@@ -153,8 +163,8 @@ def remaining(name: str, version: str) -> list[str]:
     return [
         "What remains (docs/how-to/maintain.md):",
         f"1. git tag v{version} && git push origin v{version}, then approve the upload in Actions",
-        f"2. push the images {images} to a registry of yours",
-        f"3. gh release create v{version} --notes-file, with the section of CHANGELOG.md",
+        f"2. push the images {images}, built where Docker runs, to a registry of yours",
+        f"3. gh release create v{version} --title {version} --notes-file {NOTES}",
     ]
 
 

@@ -104,6 +104,10 @@ def test_a_tag_is_never_moved(release: Any, checkout: Path) -> None:
     assert f"tag v{VERSION}" in problem
 
 
+def test_the_notes_are_the_changelogs_newest_section(release: Any, checkout: Path) -> None:
+    assert release.newest_section(checkout) == (f"{VERSION} (2026-12-01)", "- All.\n")
+
+
 @pytest.mark.parametrize("version", ["", "7.0"])
 def test_the_program_ends_before_it_builds(version: str) -> None:
     """The index is not asked for the version's sake: nothing answers there."""
