@@ -1,7 +1,7 @@
 SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help setup install vulkan demo test bare check docs format types bench pins
+.PHONY: help setup install vulkan demo test bare check docs format types bench pins release
 
 BIN := .venv/bin
 # The folders that pyproject.toml maps under robomme_interference_data.
@@ -30,7 +30,7 @@ demo: install  ## Set up, then show a lesson used, buried and found again.
 test: setup  ## Set up, then run the tests; ARGS="-m ''" adds the slow ones.
 	@$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
-bare: setup  ## Install the wheel without pins, newest and lowest versions, and use it.
+bare: setup  ## Install the package without pins, newest and lowest versions, and use it.
 	@PYTHONPATH=tests $(BIN)/python scripts/bare_install.py
 
 check: setup types  ## Lint; check the format, the types and who imports whom.
@@ -63,3 +63,6 @@ pins: setup  ## Remake requirements.txt; ARGS=--upgrade for newer versions.
 	@$(BIN)/uv pip compile --quiet --universal --python-version 3.12 --all-extras --group dev \
 	  --no-annotate --no-emit-index-url --no-emit-package opencv-python \
 	  --custom-compile-command "make pins" --output-file requirements.txt pyproject.toml $(ARGS)
+
+release: setup  ## Check and rehearse all of a release but its last steps: VERSION=1.0.0.
+	@PYTHONPATH=tests $(BIN)/python scripts/release.py "$${VERSION:-}"

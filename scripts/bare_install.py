@@ -1,6 +1,7 @@
-"""Install the wheel as a new user does, without pins, and use it: `make bare`.
+"""Install the package by its name as a new user does, without pins, and use it: `make bare`.
 
-Once with the newest versions that the index serves and once with the lowest that `pyproject.toml`
+It is uploaded to a package index on the loopback interface, and installed from there. Once with the
+newest versions that the configured index serves and once with the lowest that `pyproject.toml`
 declares: the pins of `.venv` hide what breaks with either. Every extra is resolved, not installed.
 """
 
@@ -15,13 +16,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from distribution import ROOT, build, configured_index, uploaded
 from support.hub import BUFFER_SET, push_buffer_set
 from support.hub_server import HubServer
 from support.package import HEAVY
 
 from robomme_interference_data import load_buffer
 
-ROOT = Path(__file__).resolve().parents[1]
 GOLDEN = ROOT / "tests" / "golden"
 UV = Path(sys.executable).with_name("uv")
 QUERY, CONDITION = "MoveCube/test/0", "k3"
@@ -30,6 +31,7 @@ NOWHERE = "http://127.0.0.1:9"
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 NAME: str = PROJECT["name"]
+VERSION: str = PROJECT["version"]
 CORE: list[str] = PROJECT["dependencies"]
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
 
@@ -47,19 +49,21 @@ print(*[name for name in sys.argv[4:] if find_spec(name)])
 
 def main() -> None:
     """Check both resolutions; exit with an error at the first thing that fails."""
-    os.environ.update(index_of_pip())
-    with tempfile.TemporaryDirectory(prefix="bare-install-") as folder, hub(Path(folder)) as server:
-        wheel = build_wheel(Path(folder))
-        for resolution in ("highest", "lowest-direct"):
-            BareInstall(Path(folder), wheel, resolution, server.endpoint).check()
+    with tempfile.TemporaryDirectory(prefix="distributions-") as folder:
+        build(Path(folder))
+        check_installs(Path(folder), "highest", "lowest-direct")
 
 
-def index_of_pip() -> dict[str, str]:
-    """Return the setting with which uv uses pip's index, as in scripts/setup.sh."""
-    query = [sys.executable, "-m", "pip", "config", "get", "global.index-url"]
-    configured = subprocess.run(query, capture_output=True, text=True, check=False).stdout.strip()
-    index = os.environ.get("PIP_INDEX_URL", configured)
-    return {"UV_DEFAULT_INDEX": index} if index and "UV_DEFAULT_INDEX" not in os.environ else {}
+def check_installs(distributions: Path, *resolutions: str) -> None:
+    """Upload distributions to an index on loopback, and install and use them from there."""
+    os.environ["UV_DEFAULT_INDEX"] = configured_index()
+    with (
+        tempfile.TemporaryDirectory(prefix="bare-install-") as folder,
+        hub(Path(folder)) as server,
+        uploaded(distributions) as index,
+    ):
+        for resolution in resolutions:
+            BareInstall(Path(folder), index.simple, resolution, server.endpoint).check()
 
 
 @contextmanager
@@ -70,19 +74,12 @@ def hub(folder: Path) -> Iterator[HubServer]:
         yield server
 
 
-def build_wheel(folder: Path) -> Path:
-    """Return a wheel of the checkout, made with the setuptools of `.venv`."""
-    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder)]
-    subprocess.run([*command, str(ROOT)], stdout=subprocess.DEVNULL, check=True)
-    return next(folder.glob("*.whl"))
-
-
 class BareInstall:
-    """An environment with the wheel and what it requires, and nothing else."""
+    """An environment with the package and what it requires, and nothing else."""
 
-    def __init__(self, folder: Path, wheel: Path, resolution: str, endpoint: str):
+    def __init__(self, folder: Path, index: str, resolution: str, endpoint: str):
         self.folder = folder / resolution
-        self.wheel = wheel
+        self.index = index
         self.resolution = resolution
         self.programs = self.folder / "venv" / "bin"
         own = {"HF_ENDPOINT": endpoint, "HF_HOME": str(self.folder / "hub"), "HF_HUB_OFFLINE": "0"}
@@ -104,13 +101,14 @@ class BareInstall:
         print(f"bare install: works with the {self.resolution} versions")
 
     def install(self, extra: str | None = None, *options: str) -> None:
-        """Install the wheel; its requirements are named too, which makes them direct ones."""
-        what = str(self.wheel) if extra is None else f"{self.wheel}[{extra}]"
+        """Install the package; its requirements are named too, which makes them direct ones."""
+        extras = "" if extra is None else f"[{extra}]"
         required = CORE + [one for one in EXTRAS.get(extra or "", []) if not one.startswith(NAME)]
         python = ("--python", self.programs / "python")
-        self.uv(
-            "pip", "install", *python, "--resolution", self.resolution, *options, what, *required
-        )
+        # An earlier index on loopback may have had the same port.
+        index = ("--index", self.index, "--refresh-package", NAME, "--resolution", self.resolution)
+        package = f"{NAME}{extras}=={VERSION}"
+        self.uv("pip", "install", *python, *index, *options, package, *required)
 
     def uv(self, *arguments: str | Path) -> None:
         """Run uv outside the checkout, whose settings for uv a user does not have."""

@@ -1,4 +1,4 @@
-"""What is published of the package: sdist and wheel; `scripts/bare_install.py` uses the latter."""
+"""What is published of the package: sdist and wheel, which `make bare` uses."""
 
 import shutil
 import subprocess
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.package import PACKAGE, ROOT, committable, module_files
+from support.package import CONFIG, PACKAGE, ROOT, committable, module_files
 
 pytestmark = pytest.mark.slow  # test_packaging.py compares the lists of files
 
@@ -55,17 +55,36 @@ def test_the_sdist_holds_what_the_wheel_needs_and_nothing_else(distributions: Pa
     assert found - made == own | {"LICENSE", "README.md", "pyproject.toml"}
 
 
-def test_the_package_index_would_take_both(distributions: Path) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "twine",
-        "check",
-        "--strict",
-        *map(str, distributions.iterdir()),
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout.count("PASSED")) == (0, 2), done.stdout
+def test_twine_uploads_both_and_uv_installs_them_by_name(
+    distributions: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The index has rules, too: no file is replaced, and a name has an owner."""
+    monkeypatch.syspath_prepend(ROOT / "scripts")
+    from distribution import quietly, uploaded
+
+    with uploaded(distributions) as index:
+        [project] = index.projects.values()
+        assert [*project.files] == sorted(path.name for path in distributions.iterdir())
+        uv, python = Path(sys.executable).with_name("uv"), tmp_path / "venv" / "bin" / "python"
+        venv = [uv, "venv", "--quiet", "--python", sys.executable, tmp_path / "venv"]
+        subprocess.run(venv, check=True)
+        install = [uv, "pip", "install", "--quiet", "--no-cache", "--no-deps", "--python", python]
+        name = CONFIG["project"]["name"]
+        subprocess.run([*install, "--default-index", index.simple, name], check=True)
+        code = f"from importlib.metadata import version; print(version('{name}'))"
+        done = subprocess.run([python, "-c", code], capture_output=True, text=True, check=True)
+        assert done.stdout.strip() == CONFIG["project"]["version"]
+
+        index.passwords["somebody"] = "else"
+        wheel = str(next(distributions.glob("*.whl")))
+        for user, password, says in (
+            ("rehearsal", "rehearsal", "400"),  # the file exists
+            ("somebody", "else", "403"),  # the name is another user's
+            ("somebody", "wrong", "403"),
+        ):
+            login = ("--username", user, "--password", password, "--non-interactive")
+            with pytest.raises(SystemExit, match=says):
+                quietly("twine", "upload", "--repository-url", index.legacy, *login, wheel)
 
 
 USER = """

@@ -93,7 +93,7 @@ an entry that fits no step is an error."""
 
 OTHER_PROGRAMS = {
     *("pip", "export", "hf", "uv", "swift", "vllm", "lerobot-train", "vla-eval", "cd"),
-    *("python", "IMAGE_MAX_TOKEN_NUM=256", "git", "scripts/install_robomme.sh", "exec"),
+    *("python", "IMAGE_MAX_TOKEN_NUM=256", "git", "make", "scripts/install_robomme.sh", "exec"),
 }
 """Programs that are not this package's; those that train and answer have tests of their own."""
 
