@@ -7,7 +7,7 @@ conditions=no-history,day-alone,day-k0,day-k1,day-k3,day-k7,day-cut-k0,day-cut-k
 if [ "${1:-}" = act ]; then
     roll() {
         robomme-interference evaluate test-days --simulator tabletop-day \
-            --families MoveCube,PatternLock,RouteStick --workers 2 "$@"
+            --families MoveCube,PatternLock,RouteStick --set cache=true "$@"
     }
     roll --policy replay:framesamp --conditions day-alone,day-k7,day-cut-k7 --out acted/replay
     roll --policy replay:framesamp --conditions day-k7 --retrieval thumbnail \
