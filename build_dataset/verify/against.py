@@ -17,7 +17,7 @@ from .dataset import Violation
 
 
 @dataclass(frozen=True)
-class Comparison:
+class PlanComparison:
     """How a buffer set compares with a reference plan.
 
     Attributes:
@@ -32,7 +32,7 @@ class Comparison:
     digests: int
 
 
-def compare(found: ReferencePlan, plan: ReferencePlan) -> Comparison:
+def compare(found: ReferencePlan, plan: ReferencePlan) -> PlanComparison:
     """Compare the plan of a buffer set with a reference plan; no order of either has an effect.
 
     The buffers of the plan must be there with the same sessions, and the pool must be the same.
@@ -47,7 +47,7 @@ def compare(found: ReferencePlan, plan: ReferencePlan) -> Comparison:
         *_digests(digests, found, plan),
     ]
     notes = [*_further(found, plan), *_other_images(digests, found, plan)]
-    return Comparison(tuple(differences), tuple(notes), len(digests))
+    return PlanComparison(tuple(differences), tuple(notes), len(digests))
 
 
 def _settings(found: ReferencePlan, plan: ReferencePlan) -> Iterator[Violation]:

@@ -73,8 +73,7 @@ def _queries(buffer_set: BufferSet) -> Iterator[ReferenceQuery]:
     buffers = defaultdict[EpisodeId, dict[str, tuple[ReferenceSession, ...]]](dict)
     for manifest in buffer_set.planned_manifests():
         buffers[manifest.episode_id][manifest.condition] = tuple(
-            ReferenceSession(entry.role, entry.dataset, entry.source)
-            for entry in manifest.sessions
+            ReferenceSession(entry.role, entry.dataset, entry.source) for entry in manifest.sessions
         )
     for episode, sessions in buffers.items():
         used = dict.fromkeys(session for buffer in sessions.values() for session in buffer)

@@ -53,13 +53,20 @@ class PlanOptions:
         found = reference_plan(opened)
         if self.file is not None:
             write_plan(found, self.file)
-            print_status(f"{self.file}: the plan of {counted(len(found.queries), 'query', 'queries')}")
+            print_status(
+                f"{self.file}: the plan of {counted(len(found.queries), 'query', 'queries')}"
+            )
         if self.plan is None:
             return False
         return self._compare(found, self.plan, report, as_json=as_json)
 
     def _compare(
-        self, found: "ReferencePlan", plan: "ReferencePlan", report: dict[str, Any], *, as_json: bool
+        self,
+        found: "ReferencePlan",
+        plan: "ReferencePlan",
+        report: dict[str, Any],
+        *,
+        as_json: bool,
     ) -> bool:
         from robomme_interference_data.build_dataset.verify.against import compare
 

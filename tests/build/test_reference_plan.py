@@ -16,7 +16,7 @@ from support.make_plans import planned
 from support.messages import raises
 
 from robomme_interference_data import load_buffer_set
-from robomme_interference_data.build_dataset.verify.against import Comparison, compare
+from robomme_interference_data.build_dataset.verify.against import PlanComparison, compare
 from robomme_interference_data.build_dataset.verify.reference import (
     PLANS,
     plan_text,
@@ -93,7 +93,7 @@ def test_a_plan_is_written_once_and_read_back(plan: ReferencePlan, tmp_path: Pat
     write_plan(plan, tmp_path / "plan.json")
     assert read_plan(str(tmp_path / "plan.json")) == plan
     assert read_plan(str(GOLDEN)) == plan
-    assert compare(plan, plan) == Comparison((), (), len(plan.episodes))
+    assert compare(plan, plan) == PlanComparison((), (), len(plan.episodes))
 
 
 @given(st.randoms(use_true_random=False))
@@ -146,10 +146,7 @@ TAMPERED: dict[str, tuple[Callable[[ReferencePlan], ReferencePlan], dict[str, st
     ),
     "unit that is not in the plan": (
         lambda plan: replace(plan, episodes=plan.episodes[:-1]),
-        {
-            "distractors": "RouteStick/train/1 are not in the plan, and change which units are "
-            "drawn"
-        },
+        {"distractors": "RouteStick/train/1 are not in the plan, and change which units are drawn"},
     ),
     "query": (
         lambda plan: replace(
@@ -203,7 +200,7 @@ def test_images_of_another_renderer_are_noted_only(plan: ReferencePlan) -> None:
     [note] = comparison.notes
     assert not comparison.differences and "1 of 3 compared episodes" in note and "a GPU" in note
     without = [replace(episode, digests={}) for episode in plan.episodes]
-    assert compare(plan, replace(plan, episodes=tuple(without))) == Comparison((), (), 0)
+    assert compare(plan, replace(plan, episodes=tuple(without))) == PlanComparison((), (), 0)
 
 
 def test_more_than_the_plan_is_no_difference(plan: ReferencePlan) -> None:

@@ -1,8 +1,8 @@
 """Make the reference plans of the package, from what is recorded of their episodes.
 
-`PYTHONPATH=tests python tests/support/make_plans.py official DATASET… ` takes lengths of lessons from
-`docs/results/robomme/lessons.parquet`, the pool of units from a dataset of distractors, and digests
-from all given datasets, whose other episodes keep theirs.
+`PYTHONPATH=tests python tests/support/make_plans.py official DATASET…` takes the lengths of lessons
+from `docs/results/robomme/lessons.parquet`, and from the given datasets the pool of units and
+digests; what the present plan has of other episodes stays.
 `… make_plans.py tutorial BUFFER_SET` takes all of a buffer set.
 """
 
