@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.buffer_sets import GOLDEN, plan_again
-from support.make_plans import planned
+from support.make_plans import planned, recorded_lessons
 from support.messages import raises
 
 from robomme_interference_data import load_buffer_set
@@ -84,6 +84,18 @@ def test_units_are_used_about_equally_often() -> None:
         len({session.source.family for session in query.buffer("k7")}) == 8
         for query in plan.queries
     )
+
+
+@pytest.mark.slow
+def test_recorded_lessons_have_the_digests_of_the_official_plan(shared_data: Path) -> None:
+    """They were recorded on RoboMME's own fork of ManiSkill."""
+    lessons = {episode.episode: episode for episode in read_plan("official").episodes}
+    recorded = [*recorded_lessons(shared_data / "lessons")]
+    assert len(recorded) == 9
+    for lesson in recorded:
+        planned_lesson = lessons[lesson.episode]
+        assert planned_lesson.frames == lesson.frames
+        assert lesson.digests.items() <= planned_lesson.digests.items()
 
 
 # --- a buffer set against a plan ----------------------------------------------------------------

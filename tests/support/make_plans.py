@@ -2,16 +2,20 @@
 
 `PYTHONPATH=tests python tests/support/make_plans.py official DATASET…` takes the lengths of lessons
 from `docs/results/robomme/lessons.parquet`, and from the given datasets the pool of units and
-digests; what the present plan has of other episodes stays.
+digests; what the present plan has of other episodes stays. A folder of recorded lessons, as in
+`../shared/data`, is one more source of digests.
 `… make_plans.py tutorial BUFFER_SET` takes all of a buffer set.
 """
 
 import sys
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
+import av
+import numpy as np
 import pyarrow.parquet as pq
 from support.buffer_sets import plan_again
 from support.made_up import record, write_metadata
@@ -26,15 +30,19 @@ from robomme_interference_data.build_dataset.verify.reference import (
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     FORMAT_VERSION,
+    FRONT,
+    IDENTITY_PATH,
     OFFICIAL,
     PAPER_UNIT,
     RULE_VERSION,
+    STATE,
 )
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.renderers import dataset_renderers
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS
 from robomme_interference_data.schema.reference_plan import ReferenceEpisode, ReferencePlan
+from robomme_interference_data.storage.arrays import FeatureDigests
 from robomme_interference_data.storage.files import LocalFiles
 
 LESSONS = Path(__file__).parents[2] / "docs" / "results" / "robomme" / "lessons.parquet"
@@ -66,7 +74,24 @@ def planned(plan: ReferencePlan, folder: Path) -> ReferencePlan:
     return replace(made_again, episodes=episodes, renderers=plan.renderers)
 
 
-def official(datasets: Iterable[Dataset], folder: Path) -> ReferencePlan:
+def recorded_lessons(folder: Path) -> Iterator[ReferenceEpisode]:
+    """Yield the lessons of a folder with what is recorded of them: front images and states."""
+    for path in sorted(folder.glob("*.npz")):
+        with np.load(path) as arrays:
+            lesson = int(arrays["exec_start_idx"])
+            family, index = str(arrays["env_id"]), int(arrays["episode"])
+            digests = FeatureDigests()
+            digests.update(STATE, arrays["state"][:lesson])
+        with av.open(str(path.with_name(f"{path.stem}_front.mkv"))) as video:
+            for frame in islice(video.decode(video=0), lesson):
+                digests.update(FRONT, frame.to_ndarray(format="rgb24"))
+        episode = EpisodeId(family, "test", index)
+        yield ReferenceEpisode(DEMONSTRATIONS, episode, lesson, digests.current())
+
+
+def official(
+    datasets: Iterable[Dataset], recorded: Iterable[ReferenceEpisode], folder: Path
+) -> ReferencePlan:
     """Return the plan of the official query episodes."""
     renderers: dict[str, str | None] = {}
     known: dict[tuple[str, EpisodeId], ReferenceEpisode] = {}
@@ -86,6 +111,9 @@ def official(datasets: Iterable[Dataset], folder: Path) -> ReferencePlan:
             digests = dict(known[key].digests) if key in known else {}
             digests |= stored.feature_sha256
             known[key] = ReferenceEpisode(*key, stop - start, digests)
+    for lesson in recorded:
+        key = lesson.dataset, lesson.episode
+        known[key] = replace(lesson, digests=lesson.digests | known[key].digests)
     episodes = tuple(known[key] for key in sorted(known))
     plan = ReferencePlan(
         FORMAT_VERSION,
@@ -105,8 +133,11 @@ if __name__ == "__main__":
     name, *folders = sys.argv[1:]
     if name == "official":
         with tempfile.TemporaryDirectory() as temporary:
-            opened = [Dataset(LocalFiles(Path(folder))) for folder in folders]
-            plan = official(opened, Path(temporary))
+            paths = [Path(folder) for folder in folders]
+            built = [path for path in paths if (path / IDENTITY_PATH).is_file()]
+            opened = [Dataset(LocalFiles(path)) for path in built]
+            recorded = [it for path in paths if path not in built for it in recorded_lessons(path)]
+            plan = official(opened, recorded, Path(temporary))
     else:
         plan = reference_plan(load_buffer_set(folders[0]))
     write_plan(plan, PLANS / f"{name}.json")
