@@ -10,7 +10,7 @@ from robomme_interference_data.ids import EpisodeId, format_numbers
 from robomme_interference_data.schema.reference_plan import (
     ReferenceEpisode,
     ReferencePlan,
-    ReferenceSession,
+    ReferenceQuery,
 )
 
 from .dataset import Violation
@@ -78,27 +78,30 @@ def _episodes(found: ReferencePlan, plan: ReferencePlan) -> Iterator[Violation]:
 def _buffers(found: ReferencePlan, plan: ReferencePlan) -> Iterator[Violation]:
     """Yield queries with other sessions than in the plan, each difference once."""
     queries = {query.episode: query for query in found.queries}
+    if lacking := {query.episode for query in plan.queries} - queries.keys():
+        yield Violation("queries", f"{_listed(lacking)} are in the plan only")
     for planned in sorted(plan.queries, key=lambda query: query.episode):
         query = queries.get(planned.episode)
         if query is None:
-            yield Violation(str(planned.episode), "is a query in the plan only")
             continue
         conditions = defaultdict[str, list[str]](list)
-        for condition in plan.conditions:
-            if condition in query.buffers and condition in planned.buffers:
-                what = _first_difference(query.buffer(condition), planned.buffer(condition))
+        for condition in planned.buffers:
+            if condition in found.conditions:  # others are reported once for all queries
+                what = _difference(query, planned, condition)
                 if what is not None:
                     conditions[what].append(condition)
         for what, names in conditions.items():
             yield Violation(f"{planned.episode} under {', '.join(names)}", what)
 
 
-def _first_difference(
-    here: tuple[ReferenceSession, ...], there: tuple[ReferenceSession, ...]
-) -> str | None:
-    for number, (session, planned) in enumerate(zip(here, there, strict=False)):
-        if session != planned:
-            return f"session {number} is {session}; the plan has {planned}"
+def _difference(query: ReferenceQuery, planned: ReferenceQuery, condition: str) -> str | None:
+    """Return the first difference of a query's buffers under a condition, or None."""
+    if condition not in query.buffers:
+        return "is in the plan only"
+    here, there = query.buffer(condition), planned.buffer(condition)
+    for number, (session, other) in enumerate(zip(here, there, strict=False)):
+        if session != other:
+            return f"session {number} is {session}; the plan has {other}"
     if len(here) != len(there):
         return f"{counted(len(here), 'session')}; the plan has {len(there)}"
     return None

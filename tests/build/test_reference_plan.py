@@ -165,7 +165,7 @@ TAMPERED: dict[str, tuple[Callable[[ReferencePlan], ReferencePlan], dict[str, st
             plan,
             queries=(*plan.queries, replace(plan.queries[0], episode=plan.episodes[-1].episode)),
         ),
-        {"RouteStick/train/1": "is a query in the plan only"},
+        {"queries": "RouteStick/train/1 are in the plan only"},
     ),
     "order of units": (
         other_unit,
