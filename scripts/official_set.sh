@@ -38,7 +38,7 @@ done
 license=other
 case $plan in
   official)
-    options=(--source robomme --split test --episodes 0-49 --unit-episodes 0-3)
+    options=(--source robomme --split test --episodes 0-49 --unit-episodes 0-7)
     license=apache-2.0
     ;;
   tutorial)

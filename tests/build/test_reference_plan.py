@@ -78,7 +78,7 @@ def test_the_official_plan_is_of_the_benchmark() -> None:
     assert {unit.episode.index for unit in units} == {*parse_numbers(numbers)}
     lessons = [episode for episode in plan.episodes if episode.dataset == "demonstrations"]
     digests = [lesson for lesson in lessons if "observation.images.front" in lesson.digests]
-    assert len(digests) >= 12 and plan.renderers["demonstrations"]
+    assert len(digests) >= 18 and plan.renderers["demonstrations"]
 
 
 def test_units_are_used_about_equally_often() -> None:
