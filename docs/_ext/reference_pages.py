@@ -35,6 +35,9 @@ ROWS = {
     "Spans of a day": "schema.records:DaySpan",
     "Queries of a day": "schema.records:DayQuery",
     "Identity of a dataset: `meta/interference.json`": "schema.records:DatasetIdentity",
+    "Reference plan, such as `official.json`": "schema.reference_plan:ReferencePlan",
+    "Episodes of a reference plan": "schema.reference_plan:ReferenceEpisode",
+    "Queries of a reference plan": "schema.reference_plan:ReferenceQuery",
     "Rollouts: `rollouts.jsonl`, `.csv`, `.parquet`": "evaluate.run.row:Rollout",
     "Questions: `questions.parquet`": "data.questions:Question",
 }

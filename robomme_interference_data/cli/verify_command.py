@@ -20,6 +20,7 @@ from robomme_interference_data.schema.settings import changed_settings
 
 from .console import echo, print_json, print_status
 from .options import AsJson, with_settings
+from .verify_plan import PlanOptions
 
 if TYPE_CHECKING:
     from robomme_interference_data.build_dataset.verify.dataset import Violation
@@ -75,6 +76,23 @@ def verify(
             show_default=False,
         ),
     ] = None,
+    against: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PLAN",
+            help="Also compare sessions, lengths and digests with a reference plan: official, "
+            "tutorial, a file that --write-plan wrote, or another buffer set.",
+            show_default=False,
+        ),
+    ] = None,
+    write_plan: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Write the plan of a buffer set without violations as a reference plan.",
+            show_default=False,
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Recompute every hash and rule of a buffer set and list the violations; fails if there is one.
@@ -86,37 +104,49 @@ def verify(
     observation without any memory: each episode is guessed from the others of its family. Queries
     of days are also guessed from the clock and the place of their lessons.
 
+    A reference plan states the sessions of every buffer, the pool of units, lengths and digests.
+    With --against, these must be equal, digests of images only where the renderer is the same.
+
     Examples:
     ```
     robomme-interference verify my-buffers
     robomme-interference verify my-buffers --audit --no-decode
     robomme-interference verify my-buffers --replay tabletop --episodes 0-4
+    robomme-interference verify tutorial/buffers --against tutorial
     robomme-interference verify --source frames:mine
     ```
     """
-    if _of_sources(sources, buffer_set, decode=decode, audit=audit, replay=replay):
+    without_effect_on_sources = {
+        "--audit": audit,
+        "--replay": replay is not None,
+        "--no-decode": not decode,
+        "--against": against is not None,
+        "--write-plan": write_plan is not None,
+    }
+    given = [option for option, is_given in without_effect_on_sources.items() if is_given]
+    if _of_sources(sources, buffer_set, given, replay=replay):
         from .verify_source import verify_sources
 
         verify_sources(sources, Path(buffer_set or _FOR_SOURCES), as_json=as_json)
     else:
         assert buffer_set is not None
         played = None if replay is None else _PlayedAgain(replay, sources)
-        _verify_buffer_set(buffer_set, played, decode=decode, audit=audit, as_json=as_json)
+        plans = PlanOptions.read(against, write_plan)
+        _verify_buffer_set(buffer_set, played, plans, decode=decode, audit=audit, as_json=as_json)
 
 
 def _of_sources(
-    sources: SourceConfig, buffer_set: str | None, *, decode: bool, audit: bool, replay: str | None
+    sources: SourceConfig, buffer_set: str | None, given: list[str], *, replay: str | None
 ) -> bool:
-    """Return whether sources are verified, not a buffer set.
+    """Return whether sources are verified, not a buffer set; `given` are options for the latter.
 
     Raises:
         InvalidOptionError: Neither is given, or options without effect.
     """
     if sources.source:
-        given = {"--audit": audit, "--replay": replay is not None, "--no-decode": not decode}
-        if without_effect := [option for option, is_given in given.items() if is_given]:
+        if given:
             raise InvalidOptionError(
-                f"{without_effect[0]} has no effect on {named('source')}",
+                f"{given[0]} has no effect on {named('source')}",
                 "Leave it out: all frames of a source are read.",
             )
         return True
@@ -176,7 +206,13 @@ class _PlayedAgain:
 
 
 def _verify_buffer_set(
-    buffer_set: str, played: _PlayedAgain | None, *, decode: bool, audit: bool, as_json: bool
+    buffer_set: str,
+    played: _PlayedAgain | None,
+    plans: PlanOptions,
+    *,
+    decode: bool,
+    audit: bool,
+    as_json: bool,
 ) -> None:
     from robomme_interference_data.build_dataset.verify.buffer_set import (
         verify_buffer_set,
@@ -212,15 +248,18 @@ def _verify_buffer_set(
         _print_extent(report)
         if played is not None and "played_again" not in report:
             print_status("Nothing was played again: correct the violations first.")
-    leaks = False
+    leaks = differs = False
     if opened is not None and not violations:
         _warn(opened, report, as_json=as_json)
         leaks = audit and _audit(opened, report, as_json=as_json)
+        differs = plans.used and plans.carry_out(opened, report, as_json=as_json)
+    elif plans.used:
+        print_status("No plan was compared or written: correct the violations first.")
     if as_json:
         print_json(report)
     if incomplete is not None:
         raise incomplete
-    if violations or leaks:
+    if violations or leaks or differs:
         raise typer.Exit(1)
 
 

@@ -25,6 +25,12 @@ from support.recordings import encode_image
 from support.tabletop import TABLETOP
 
 from robomme_interference_data import load_buffer_set
+from robomme_interference_data.build_dataset.verify.against import compare
+from robomme_interference_data.build_dataset.verify.reference import (
+    read_plan,
+    reference_plan,
+    write_plan,
+)
 from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.embeddings import EmbeddingIndex
@@ -32,6 +38,7 @@ from robomme_interference_data.data.questions import digest_questions, read_ques
 from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate.run.log import read_run
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
+from robomme_interference_data.schema.reference_plan import ReferencePlan
 from robomme_interference_data.simulators.robomme.recorded_scene import read_scene
 from robomme_interference_data.storage.arrays import read_array
 from robomme_interference_data.storage.files import LocalFiles, read_sums
@@ -97,7 +104,18 @@ def places(root: Path) -> Path:
     (root / "single/scene.json").write_text(_SCENES["VideoUnmaskSwap"])
     eval_info.write(root / "single/eval_info.json", {("pusht", 0): "sf", ("pusht", 1): "fs"})
     (root / "single/results.json").write_text(json.dumps(_RESULTS))
+    write_plan(_golden_plan(), root / "single/plan.json")
     return root
+
+
+@cache
+def _golden_plan() -> ReferencePlan:
+    return reference_plan(load_buffer_set(GOLDEN))
+
+
+def _plan(root: Path) -> None:
+    comparison = compare(_golden_plan(), read_plan(str(root / "single/plan.json")))
+    assert all(difference.where and difference.what for difference in comparison.differences)
 
 
 def _header(root: Path) -> None:
@@ -239,6 +257,7 @@ TARGETS = {
     "video": Target(f"buffer_set/{_VIDEO}", _video),
     "array": Target("single/a.npy", _array),
     "image": Target("single/a.png", _image),
+    "plan": Target("single/plan.json", _plan),
     "scene": Target("single/scene.json", _scene, _other_scenes),
     "questions": Target("asked/questions.parquet", _questions, rewritten),
     "sums": Target("single/SHA256SUMS", lambda root: read_sums(root / "single/SHA256SUMS")),
