@@ -1,0 +1,330 @@
+"""A board as data: its systems with their numbers, from all of its rows scored together."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.evaluate.ceiling import ceiling, chance
+from robomme_interference_data.evaluate.run.config import CeilingConfig
+from robomme_interference_data.evaluate.score.config import Expected, Settings
+from robomme_interference_data.evaluate.score.outcomes import STATUSES, Outcomes
+from robomme_interference_data.evaluate.score.partners import ceilings_of
+from robomme_interference_data.evaluate.score.scoring import Score, score
+from robomme_interference_data.evaluate.score.tables.cells import SuccessCell
+from robomme_interference_data.evaluate.score.tables.contrast import LESSON_ONLY
+from robomme_interference_data.evaluate.score.tables.ranks import all_pairs, rankings
+from robomme_interference_data.evaluate.systems import display_name
+from robomme_interference_data.schema.conditions import NO_HISTORY, in_order
+from robomme_interference_data.stats.bootstrap import Interval
+from robomme_interference_data.stats.significance import holm
+
+from .entries import Board, Standing
+from .published import Case, Grid, ranked_by
+
+_DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A system of a board, before its rows are scored.
+
+    Attributes:
+        system: Its label.
+        standing: Why it is there.
+        trained_on: What it was trained on; None if unknown.
+        case: Its submission; None for a reference.
+    """
+
+    system: str
+    standing: Standing
+    trained_on: str | None
+    case: Case | None = None
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of a board: files or folders, and the name of the system in those that state none."""
+
+    paths: tuple[Path, ...]
+    system: str | None = None
+
+
+class Standings:
+    """A board with its scored rows.
+
+    Attributes:
+        board: The board.
+        grid: What its buffer set expects; None if it has none.
+        shown: Its systems by label.
+        scored: The score of all of its rows.
+        outcomes: The outcomes in its simulator.
+        conditions: Conditions with rows, in order.
+        last: The condition that systems are ranked by.
+    """
+
+    def __init__(
+        self, board: Board, grid: Grid | None, rows: Sequence[Rows], shown: Mapping[str, Shown]
+    ):
+        self.board = board
+        self.grid = grid
+        self.shown = shown
+        names = tuple(each.system for each in rows if each.system for _ in each.paths)
+        paths = tuple(chain.from_iterable(each.paths for each in rows))
+        self.scored: Score = score(
+            Settings(rows=paths, system=names, expected=Expected.OBSERVED), _DRAWS
+        )
+        self.outcomes: Outcomes = self.scored.outcomes[board.simulator]
+        ran = {name for system in self.outcomes.systems for name in self.outcomes.ran(system)}
+        self.conditions = tuple(each.name for each in in_order(ran))
+        self.last = ranked_by(self.conditions) if grid is None else grid.last
+
+    @cached_property
+    def _cells(self) -> dict[tuple[str, str, str], SuccessCell]:
+        return {
+            (cell.system, cell.condition, cell.part): cell
+            for cell in self.scored.cells
+            if cell.simulator == self.board.simulator and cell.n
+        }
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return the systems as plain values: by success under the last condition."""
+        ranks = self._ranks()
+        differences = self._differences()
+        records = []
+        for system, shown in self.shown.items():
+            facts = next(iter(self.outcomes.facts_of(system)))
+            record: dict[str, Any] = {
+                "system": system,
+                "name": display_name(system),
+                "standing": str(shown.standing),
+                **ranks.get(system, _UNRANKED),
+                "trained_on": shown.trained_on,
+                "memory": facts.memory,
+                "retrieval": facts.retrieval,
+                **_stated(shown.case),
+                "success": {
+                    condition: _rate(cell)
+                    for condition in self.conditions
+                    if (cell := self._cells.get((system, condition, "")))
+                },
+                "families": {
+                    family: _rate(cell)
+                    for family in self.outcomes.families
+                    if (cell := self._cells.get((system, self.last, family)))
+                },
+                **self._effects(system),
+                "ceiling": self._ceiling(system),
+                "differences": differences.get(system, {}),
+                "cost": self._cost(system),
+                "outcomes": self._letters(system),
+            }
+            records.append(record)
+        return sorted(records, key=self._order)
+
+    def _order(self, record: Mapping[str, Any]) -> tuple[Any, ...]:
+        last = record["success"].get(self.last)
+        known = last is not None
+        ranked = record["standing"] == Standing.SUBMISSION
+        return (not known, -last["rate"] if known else 0, not ranked, record["system"])
+
+    def _ranks(self) -> dict[str, dict[str, Any]]:
+        """Return rank and ties of the submissions, by the paired tests of all pairs."""
+        systems = self._of(Standing.SUBMISSION, with_last=True)
+        if not systems:
+            return {}
+        rates = {name: self._cells[name, self.last, ""].rate for name in systems}
+        compared = all_pairs(self.outcomes, self.last, systems, self._everywhere)
+        found = rankings(rates, compared)
+        return {
+            name: {
+                "rank": each.rank,
+                "rank_low": each.rank_low,
+                "rank_high": each.rank_high,
+                "tied": each.rank_low < each.rank_high,
+            }
+            for name, each in found.items()
+        }
+
+    def _differences(self) -> dict[str, dict[str, Any]]:
+        """Return each system's difference to each control under the last condition, in pairs."""
+        controls = self._of(Standing.CONTROL, with_last=True)
+        compared = {
+            (system, control): pairs
+            for system in self.shown
+            if (system, self.last, "") in self._cells and system not in controls
+            for control in controls
+            for pairs in all_pairs(
+                self.outcomes, self.last, (system, control), self._everywhere
+            ).values()
+        }
+        ps = holm([pairs.p for pairs in compared.values()])
+        found: dict[str, dict[str, Any]] = {}
+        for ((system, control), pairs), p in zip(compared.items(), ps, strict=True):
+            if pairs.n:
+                values = {"n": pairs.n, "p_holm": _known(p), "paired": pairs.paired}
+                found.setdefault(system, {})[control] = _interval(pairs.change) | values
+        return found
+
+    def _of(self, standing: Standing, *, with_last: bool) -> list[str]:
+        return [
+            name
+            for name, shown in self.shown.items()
+            if shown.standing is standing
+            and (not with_last or (name, self.last, "") in self._cells)
+        ]
+
+    @property
+    def _everywhere(self) -> Any:
+        return np.ones(len(self.outcomes.episodes), bool)
+
+    def _effects(self, system: str) -> dict[str, Any]:
+        """Return the fall from k0 to the last condition, and the retention."""
+        found: dict[str, Any] = {"fall": None, "retention": None}
+        table = self.scored.tables.get("effects")
+        for row in [] if table is None else table.records():
+            key = (row["simulator"], row["system"], row["condition"])
+            if key != (self.board.simulator, system, self.last) or not row["n"]:
+                continue
+            if (row["against_system"], row["against_condition"]) == (system, LESSON_ONLY):
+                interval = Interval(row["difference"], row["low"], row["high"])
+                found["fall"] = _interval(interval) | {"n": row["n"], "p_holm": row["p_holm"]}
+            elif row["against_condition"] == NO_HISTORY and row["retention"] is not None:
+                low, high = row["retention_low"], row["retention_high"]
+                found["retention"] = {"value": row["retention"], "low": low, "high": high}
+        return found
+
+    def _ceiling(self, system: str) -> float | None:
+        """Return the ideal observer's success with the same memory under the last condition."""
+        facts = next(iter(self.outcomes.facts_of(system)))
+        if self.grid is not None and facts.memory is not None and facts.retrieval is None:
+            return self._computed(facts.memory)
+        cells = (
+            self._cells.get((name, self.last, "")) for name in ceilings_of(self.outcomes, system)
+        )
+        return next((cell.rate for cell in cells if cell), None)
+
+    def _computed(self, memory: str) -> float | None:
+        assert self.grid is not None
+        config = CeilingConfig(memory=memory, conditions=(self.last,))
+        try:
+            cells = ceiling(self.grid.buffer_set, config)
+        except InterferenceError:  # the evidence is unknown
+            return None
+        return cells[-1].success if cells else None
+
+    @cached_property
+    def chance(self) -> float | None:
+        """Success of guessing, with nothing seen of the past; None if unknown."""
+        if self.grid is not None:
+            queries = map(self.grid.buffer_set.query, self.grid.buffer_set.episode_ids)
+            return _mean(chance(query, {}) for query in queries)
+        return _mean(
+            _known(cell.chance)
+            for (_, condition, part), cell in self._cells.items()
+            if condition == self.last and not part
+        )
+
+    def _cost(self, system: str) -> dict[str, Any] | None:
+        table = self.scored.tables.get("cost")
+        for row in [] if table is None else table.records():
+            key = (row["simulator"], row["system"], row["condition"])
+            if key == (self.board.simulator, system, self.last):
+                return {name: row[name] for name in ("seconds", "seconds_per_success")}
+        return None
+
+    def _letters(self, system: str) -> dict[str, str]:
+        """Return the outcome of each episode by condition, a letter each: see `letter`."""
+        place = self.outcomes.systems.index(system)
+        return {
+            condition: "".join(map(letter, self.outcomes.counts[place, number].tolist()))
+            for number, condition in enumerate(self.outcomes.conditions)
+            if self.outcomes.has_rows[place, number]
+        }
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the board as plain values, for JSON."""
+        return {
+            "board": self.board.name,
+            "simulator": self.board.simulator,
+            "buffer_set": self.board.buffer_set,
+            "revision": self.scored.rows.revisions.get(self.board.simulator),
+            "note": self.board.note,
+            "conditions": list(self.conditions),
+            "ranked_by": self.last,
+            "chance": self.chance,
+            "notes": list(self.scored.notes),
+            "episodes": [str(episode) for episode in self.outcomes.episodes],
+            "systems": self.records(),
+        }
+
+
+_UNRANKED = {"rank": None, "rank_low": None, "rank_high": None, "tied": False}
+
+
+def letter(counts: Sequence[int]) -> str:
+    """Return the outcome of an episode's rollouts in a letter, given their number by status.
+
+    `s` all succeed, `f` none, `t` none and all time out, `e` all broke, `1` to `9` the tenths that
+    succeed, `-` there are none.
+    """
+    count = dict(zip(map(str, STATUSES), counts, strict=True))
+    counted = count["success"] + count["fail"] + count["timeout"]
+    if not counted:
+        return "e" if count["error"] else "-"
+    if count["success"] in (0, counted):
+        failed = "t" if count["timeout"] == counted else "f"
+        return "s" if count["success"] else failed
+    return str(min(max(round(10 * count["success"] / counted), 1), 9))
+
+
+def _stated(case: Case | None) -> dict[str, Any]:
+    """Return what a submission states, and where its results are."""
+    if case is None:
+        return {"remembers": None, "parameters": None, "probe": None, "runs": []}
+    return {
+        "remembers": case.submission.memory,
+        "parameters": case.submission.parameters,
+        "probe": next((each.header.probed for each in case.results), None),
+        "runs": [
+            {
+                "results": each.run.results,
+                "checkpoint": each.run.checkpoint,
+                "checkpoint_sha256": each.run.checkpoint_sha256,
+                "links": dict(each.links),
+            }
+            for each in case.results
+        ],
+    }
+
+
+def _rate(cell: SuccessCell) -> dict[str, Any]:
+    low, high = cell.interval
+    return {
+        "n": cell.n,
+        "rate": cell.rate,
+        "low": low,
+        "high": high,
+        "training_runs": cell.runs,
+        "complete": cell.complete,
+    }
+
+
+def _interval(interval: Interval) -> dict[str, Any]:
+    value, low, high = map(_known, interval)
+    return {"value": value, "low": low, "high": high}
+
+
+def _known(value: float | None) -> float | None:
+    return None if value is None or math.isnan(value) else value
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
