@@ -3,7 +3,6 @@
 import json
 import os
 from collections.abc import Mapping
-from importlib import resources
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -13,7 +12,7 @@ from robomme_interference_data.storage.files import write_text
 from robomme_interference_data.viz.tables import p_text, percent, points
 from robomme_interference_data.viz.templates import fill
 
-from .entries import Standing
+_WHAT = "the page of a leaderboard"
 
 _TRAINED = {"interference": "yes", "other": "no", "nothing": "no", None: "unknown"}
 """The column that states what was trained on interference."""
@@ -39,12 +38,7 @@ def write_page(data: Mapping[str, Any], path: Path, opened_in: Path) -> None:
         "pinned": lambda text: text.partition("@")[0],
     }
     html = fill(
-        __package__,
-        "leaderboard.html.j2",
-        values,
-        what="the leaderboard's page",
-        autoescape=True,
-        filters=filters,
+        __package__, "leaderboard.html.j2", values, what=_WHAT, autoescape=True, filters=filters
     )
     write_text(path, html)
 
@@ -56,20 +50,26 @@ def slug(text: str) -> str:
 
 def _shared(name: str) -> str:
     """Return style or script of the score's report, which is the same here."""
-    folder = resources.files(report.__name__).joinpath("templates")
-    text = folder.joinpath(name).read_text(encoding="utf-8")
-    return text
+    return fill(report.__name__, name, {}, what=_WHAT)
 
 
 def _groups(board: Mapping[str, Any]) -> dict[str, Any]:
     """Return the systems and families that parts of a board show."""
     ran = [system for system in board["systems"] if board["ranked_by"] in system["success"]]
+    names = {system["system"]: system["name"] for system in board["systems"]}
     families = dict.fromkeys(name for system in ran for name in system["families"])
     return {
         "ran": ran,
-        "controls": [system for system in ran if system["standing"] == Standing.CONTROL],
+        "lines": {
+            system["system"]: system["success"][board["controls"][system["system"]]]["rate"]
+            for system in board["systems"]
+            if system["system"] in board["controls"]
+        },
+        "names": names,
+        "control_names": [names[control] for control in board["controls"]],
         "compared": [system for system in ran if system["differences"]],
         "families": [*families],
+        "others": [name for name in board["conditions"] if name != board["ranked_by"]],
     }
 
 

@@ -15,10 +15,11 @@ from robomme_interference_data.evaluate.ceiling import ceiling, chance
 from robomme_interference_data.evaluate.run.config import CeilingConfig
 from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.outcomes import STATUSES, Outcomes
-from robomme_interference_data.evaluate.score.partners import ceilings_of
+from robomme_interference_data.evaluate.score.partners import ceilings_of, share_weights
 from robomme_interference_data.evaluate.score.scoring import Score, score
 from robomme_interference_data.evaluate.score.tables.cells import SuccessCell
 from robomme_interference_data.evaluate.score.tables.contrast import LESSON_ONLY
+from robomme_interference_data.evaluate.score.tables.pairs import compare_cells
 from robomme_interference_data.evaluate.score.tables.ranks import all_pairs, rankings
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.conditions import NO_HISTORY, in_order
@@ -136,11 +137,16 @@ class Standings:
 
     def _ranks(self) -> dict[str, dict[str, Any]]:
         """Return rank and ties of the submissions, by the paired tests of all pairs."""
-        systems = self._of(Standing.SUBMISSION, with_last=True)
+        systems = [
+            name
+            for name, shown in self.shown.items()
+            if shown.standing is Standing.SUBMISSION and self._ran_last(name)
+        ]
         if not systems:
             return {}
         rates = {name: self._cells[name, self.last, ""].rate for name in systems}
-        compared = all_pairs(self.outcomes, self.last, systems, self._everywhere)
+        everywhere = np.ones(len(self.outcomes.episodes), bool)
+        compared = all_pairs(self.outcomes, self.last, systems, everywhere)
         found = rankings(rates, compared)
         return {
             name: {
@@ -152,17 +158,32 @@ class Standings:
             for name, each in found.items()
         }
 
+    @cached_property
+    def controls(self) -> dict[str, str]:
+        """The controls, with the condition that others are compared with.
+
+        A control that ran without history only, such as a guess, sees none under any condition.
+        """
+        return {
+            name: self.last if self._ran_last(name) else NO_HISTORY
+            for name, shown in self.shown.items()
+            if shown.standing is Standing.CONTROL
+            if self._ran_last(name) or (name, NO_HISTORY, "") in self._cells
+        }
+
     def _differences(self) -> dict[str, dict[str, Any]]:
-        """Return each system's difference to each control under the last condition, in pairs."""
-        controls = self._of(Standing.CONTROL, with_last=True)
+        """Return each system's difference to each control, on the same episodes."""
         compared = {
-            (system, control): pairs
+            (system, control): compare_cells(
+                self.outcomes.status[self.outcomes.cell(control, condition)],
+                self.outcomes.status[self.outcomes.cell(system, self.last)],
+                self.outcomes.training,
+                same_weights=share_weights(self.outcomes, system, control),
+                paired=self.outcomes.pairable(system, control),
+            )
             for system in self.shown
-            if (system, self.last, "") in self._cells and system not in controls
-            for control in controls
-            for pairs in all_pairs(
-                self.outcomes, self.last, (system, control), self._everywhere
-            ).values()
+            if self._ran_last(system) and system not in self.controls
+            for control, condition in self.controls.items()
         }
         ps = holm([pairs.p for pairs in compared.values()])
         found: dict[str, dict[str, Any]] = {}
@@ -172,17 +193,8 @@ class Standings:
                 found.setdefault(system, {})[control] = _interval(pairs.change) | values
         return found
 
-    def _of(self, standing: Standing, *, with_last: bool) -> list[str]:
-        return [
-            name
-            for name, shown in self.shown.items()
-            if shown.standing is standing
-            and (not with_last or (name, self.last, "") in self._cells)
-        ]
-
-    @property
-    def _everywhere(self) -> Any:
-        return np.ones(len(self.outcomes.episodes), bool)
+    def _ran_last(self, system: str) -> bool:
+        return (system, self.last, "") in self._cells
 
     def _effects(self, system: str) -> dict[str, Any]:
         """Return the fall from k0 to the last condition, and the retention."""
@@ -259,6 +271,7 @@ class Standings:
             "conditions": list(self.conditions),
             "ranked_by": self.last,
             "chance": self.chance,
+            "controls": self.controls,
             "notes": list(self.scored.notes),
             "episodes": [str(episode) for episode in self.outcomes.episodes],
             "systems": self.records(),

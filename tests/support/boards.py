@@ -1,0 +1,99 @@
+"""A leaderboard over the tiny buffer set: published runs, and files that list them."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import yaml
+from support import runs, worlds
+from support.buffer_sets import GOLDEN
+
+from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD, RUN_TABLES
+from robomme_interference_data.evaluate.leaderboard.published import CARD, RATES
+from robomme_interference_data.evaluate.run.row import Rollout, row_of
+from robomme_interference_data.evaluate.score.config import Expected, Settings
+from robomme_interference_data.evaluate.score.scoring import score
+from robomme_interference_data.schema.codec import arrow_schema, to_table
+from robomme_interference_data.storage.text import canonical_json
+
+BOARD, SYSTEM = "tiny", "my-memory"
+SHA256 = "ab" * 32
+
+Files = dict[str, bytes]
+Change = Callable[[dict[str, Any]], dict[str, Any]]
+"""From a row, or from `run.json`, to another one."""
+
+
+def make_run(out: Path, policy: str, system: str, **changes: Any) -> Path:
+    """Run a policy on every buffer of the tiny buffer set, with the leak probe."""
+    all_of_it: dict[str, Any] = {"families": (), "conditions": (), "no_probe": False}
+    runs.run(out, policy=policy, system=system, **all_of_it | changes)
+    return out
+
+
+def published(run: Path) -> Files:
+    """Return the files of `publish-results` that rules read: without pictures, which are slow."""
+    names = (RUN_HEADER, RUN_RECORD, *RUN_TABLES)
+    files = {name: (run / name).read_bytes() for name in names}
+    scored = score(Settings(rows=(run,), expected=Expected.OBSERVED))
+    return files | _stated(files, scored.tables["main"].csv().encode())
+
+
+def _stated(files: Files, rates: bytes) -> Files:
+    digest = hashlib.sha256(files[RUN_TABLES[0]]).hexdigest()
+    return {CARD: f"| SHA-256 of `{RUN_TABLES[0]}` | `{digest}` |\n".encode(), RATES: rates}
+
+
+def changed(
+    files: Files, folder: Path, row: Change | None = None, header: Change | None = None
+) -> Files:
+    """Return files as if the run had had other rows or another header."""
+    folder.mkdir(parents=True)
+    content = json.loads(files[RUN_HEADER])
+    lines = files[RUN_RECORD].decode().splitlines()
+    rows = [json.loads(line) for line in lines]
+    rows = [row(each) if row else each for each in rows]
+    new = dict(files)
+    new[RUN_HEADER] = json.dumps(header(content) if header else content).encode()
+    new[RUN_RECORD] = "".join(f"{canonical_json(each)}\n" for each in rows if each).encode()
+    table = to_table([row_of(line) for line in new[RUN_RECORD].splitlines()], arrow_schema(Rollout))
+    pq.write_table(table, folder / RUN_TABLES[0])
+    new[RUN_TABLES[0]] = (folder / RUN_TABLES[0]).read_bytes()
+    for name in (RUN_HEADER, RUN_RECORD):
+        (folder / name).write_bytes(new[name])
+    rates = files[RATES]
+    with suppress(ValueError):  # rows that no score takes
+        rates = score(Settings((folder,), expected=Expected.OBSERVED)).tables["main"].csv().encode()
+    return new | _stated(new, rates)
+
+
+def submission(*results: str, **changes: Any) -> dict[str, Any]:
+    """Return a submission as it is written in the file."""
+    names = ("checkpoint", "checkpoint_sha256")
+    run = {"checkpoint": "someone/model@v1", "checkpoint_sha256": SHA256}
+    run |= {name: changes.pop(name) for name in names if name in changes}
+    entry: dict[str, Any] = {
+        "system": SYSTEM,
+        "board": BOARD,
+        "memory": "frames",
+        "trained_on": "nothing",
+        "runs": [{"results": each, **run} for each in results],
+    }
+    return entry | changes
+
+
+def write_board(path: Path, *submissions: dict[str, Any], **content: Any) -> Path:
+    """Write a file with the board of the tiny buffer set and some submissions."""
+    board = {"name": BOARD, "simulator": runs.WORLD, "buffer_set": str(GOLDEN)}
+    whole = {"boards": [board], "references": [], **content, "submissions": [*submissions]}
+    path.write_text(yaml.safe_dump(whole, sort_keys=False), encoding="utf-8")
+    return path
+
+
+def use_tiny(monkeypatch: Any) -> None:
+    """Let worlds play the tiny buffer set."""
+    monkeypatch.setenv(worlds.BUFFER_SET, str(GOLDEN))
