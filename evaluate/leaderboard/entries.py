@@ -193,9 +193,11 @@ def add_submission(path: Path, submission: Submission) -> None:
     before = _parse(text, path)
     values = {name: value for name, value in to_dict(submission).items() if value is not None}
     block = yaml.safe_dump([values], sort_keys=False, allow_unicode=True, width=1000)
-    head = text.rstrip().removesuffix("[]").rstrip() if not before.submissions else text.rstrip()
-    if not before.submissions and not head.endswith("submissions:"):
-        head += "\nsubmissions:"
+    head = text.rstrip()
+    if not before.submissions:
+        head = head.removesuffix("[]").rstrip()
+        if "submissions" not in yaml.safe_load(text):
+            head += "\nsubmissions:"
     longer = f"{head}\n{block}"
     expected = replace(before, submissions=(*before.submissions, submission))
     try:

@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -14,7 +14,7 @@ from robomme_interference_data.evaluate.score.rows.values import Row
 from robomme_interference_data.storage.files import write_json, write_text
 from robomme_interference_data.viz.tables import Columns, Table
 
-from .entries import Board, Entries, Reference, Standing
+from .entries import Board, Entries, Standing
 from .page import slug, write_page
 from .published import Grid, open_case
 from .rules import RULES, Problem, check
@@ -63,7 +63,7 @@ def _rounded(value: Any) -> Any:
 
 def check_all(entries: Entries) -> list[Problem]:
     """Return what does not hold of any submission."""
-    return [problem for board in entries.boards for problem in _gather(entries, board)[1]]
+    return [problem for board in entries.boards for problem in _gather(entries, board).problems]
 
 
 def make_leaderboard(entries: Entries, released: Sequence[Path] = ()) -> Leaderboard:
@@ -82,8 +82,8 @@ def make_leaderboard(entries: Entries, released: Sequence[Path] = ()) -> Leaderb
         )
     for board in entries.boards:
         paper = tuple(released) if board.name in papers[:1] else ()
-        gathered, found = _gather(entries, board, paper)
-        problems += found
+        gathered = _gather(entries, board, paper)
+        problems += gathered.problems
         if gathered.rows:
             boards.append(Standings(board, gathered.grid, gathered.rows, gathered.shown))
     return Leaderboard(tuple(boards), tuple(problems))
@@ -110,47 +110,57 @@ def write_site(made: Leaderboard, out: Path) -> dict[str, Any]:
 # --- one board -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Gathered:
+    """What is on a board, and why submissions are not."""
+
     grid: Grid | None
-    rows: Sequence[Rows]
-    shown: dict[str, Shown]
+    rows: list[Rows] = field(default_factory=list)
+    shown: dict[str, Shown] = field(default_factory=dict)
+    problems: list[Problem] = field(default_factory=list)
 
 
-def _gather(
-    entries: Entries, board: Board, released: tuple[Path, ...] = ()
-) -> tuple[_Gathered, list[Problem]]:
-    """Return what is on a board, and why submissions are not."""
-    grid = Grid.of(entries, board)
-    rows, shown, problems = list[Rows](), dict[str, Shown](), list[Problem]()
+def _gather(entries: Entries, board: Board, released: tuple[Path, ...] = ()) -> _Gathered:
+    """Check everything that is listed for a board."""
+    gathered = _Gathered(Grid.of(entries, board))
     for reference in [each for each in entries.references if each.board == board.name]:
-        rows.append(_rows_of(entries, reference))
-        standing = Standing(reference.standing)
-        _show(shown, rows[-1], standing, reference.trained_on)
+        paths = tuple(Path(entries.locate(path)) for path in reference.rows)
+        rows = Rows(paths, reference.system)
+        _add(gathered, board, rows, Standing(reference.standing), reference.trained_on)
     if released:
-        rows.append(Rows(released))
-        _show(shown, rows[-1], Standing.PAPER, None)
+        _add(gathered, board, Rows(released), Standing.PAPER, None)
     for submission in [each for each in entries.submissions if each.board == board.name]:
-        case = open_case(entries, submission, grid, frozenset(shown))
-        if found := check(case):
-            problems += found
-            continue
-        rows.append(Rows(tuple(each.folder for each in case.results)))
         system = submission.system
-        shown[system] = Shown(system, Standing.SUBMISSION, submission.trained_on, case)
-    return _Gathered(grid, rows, shown), problems
+        case = open_case(entries, submission, gathered.grid, frozenset(gathered.shown))
+        if problems := check(case):
+            gathered.problems += problems
+            continue
+        gathered.rows.append(Rows(tuple(each.folder for each in case.results)))
+        shown = Shown(system, Standing.SUBMISSION, submission.trained_on, case)
+        gathered.shown[system] = shown
+    return gathered
 
 
-def _rows_of(entries: Entries, reference: Reference) -> Rows:
-    paths = tuple(Path(entries.locate(path)) for path in reference.rows)
-    return Rows(paths, reference.system)
-
-
-def _show(shown: dict[str, Shown], rows: Rows, standing: Standing, trained: str | None) -> None:
-    """Add the systems of some rows."""
-    stated = [] if rows.system is None else [rows.system]
-    for system in read_rows(rows.paths, stated).names("system"):
-        shown.setdefault(system, Shown(system, standing, trained))
+def _add(
+    gathered: _Gathered, board: Board, rows: Rows, standing: Standing, trained: str | None
+) -> None:
+    """Add rows that are not ranked, whose simulator and buffer set are those of the board."""
+    read = read_rows(rows.paths, [] if rows.system is None else [rows.system])
+    expected = None if gathered.grid is None else gathered.grid.revision
+    for simulator in read.names("simulator"):
+        revision = read.revisions.get(simulator)
+        # Rows without a revision, such as the paper's, are compared unpaired.
+        other = None not in (expected, revision) and expected != revision
+        if simulator != board.simulator or other:
+            paths = ", ".join(map(str, rows.paths))
+            raise FormatError(
+                f"{paths}: rows of the simulator {simulator} and the buffer set {revision}; the "
+                f"board {board.name} has {board.simulator} and {expected or 'none'}",
+                "Name them on a board of their own.",
+            )
+    gathered.rows.append(rows)
+    for system in read.names("system"):
+        gathered.shown.setdefault(system, Shown(system, standing, trained))
 
 
 _COLUMNS: Columns = {

@@ -21,7 +21,11 @@ from robomme_interference_data.evaluate.leaderboard.entries import (
 )
 from robomme_interference_data.evaluate.leaderboard.published import RATES, ranked_by
 from robomme_interference_data.evaluate.leaderboard.rules import RULES
-from robomme_interference_data.evaluate.leaderboard.site import check_all, make_leaderboard
+from robomme_interference_data.evaluate.leaderboard.site import (
+    check_all,
+    make_leaderboard,
+    write_site,
+)
 from robomme_interference_data.evaluate.leaderboard.standings import letter
 
 Run = Callable[..., tuple[int, str, str]]
@@ -276,7 +280,7 @@ def test_boards_do_not_mix_simulators(made: Path, tmp_path: Path) -> None:
 def test_the_condition_of_the_ranks() -> None:
     assert ranked_by(("no-history", "k0", "k7", "k31")) == "k7"
     assert ranked_by(("no-history", "k0", "k3", "raw-k7")) == "k3"
-    assert ranked_by(("day-k4", "day-k8", "day-alone-k8")) == "day-k8"
+    assert ranked_by(("day-k4", "day-k8", "day-alone")) == "day-k8"
 
 
 @pytest.mark.parametrize(
@@ -294,6 +298,25 @@ def test_the_condition_of_the_ranks() -> None:
 )
 def test_letters(counts: tuple[int, ...], expected: str) -> None:
     assert letter(counts) == expected
+
+
+def test_the_written_json(tmp_path: Path) -> None:
+    """Rates, ranks, ties and differences of made-up rows, which `test_ranks.py` works out."""
+    made = boards.made_up(tmp_path)
+    data = write_site(made, tmp_path / "site")
+    written = (tmp_path / "site" / "leaderboard.json").read_text(encoding="utf-8")
+    assert written == boards.GOLDEN_JSON.read_text(encoding="utf-8")
+    assert json.loads(written) == data
+    [board] = data["boards"]
+    [first, second, *_] = board["systems"]
+    # 7 and 2 of 12: five episodes gained and none lost are p = 1/16 by McNemar's exact test.
+    assert [each["success"]["k7"]["rate"] for each in (first, second)] == [0.583333, 0.166667]
+    assert [(each["rank_low"], each["rank_high"]) for each in (first, second)] == [(1, 2), (1, 2)]
+    assert board["controls"] == {"guess": "no-history"}
+    assert first["outcomes"]["k7"] == "sssssfssffft"
+    # 7 of 12 against 1: the guess fails wherever the system fails.
+    difference = first["differences"]["guess"]
+    assert (difference["n"], difference["value"]) == (12, 0.5)
 
 
 # --- the command that adds a submission ----------------------------------------------------------

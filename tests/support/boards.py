@@ -5,19 +5,25 @@ import json
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pyarrow.parquet as pq
 import yaml
-from support import runs, worlds
+from support import runs, scoring, worlds
 from support.buffer_sets import GOLDEN
 
 from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD, RUN_TABLES
+from robomme_interference_data.evaluate.leaderboard.entries import Board, Standing
 from robomme_interference_data.evaluate.leaderboard.published import CARD, RATES
+from robomme_interference_data.evaluate.leaderboard.site import Leaderboard
+from robomme_interference_data.evaluate.leaderboard.standings import Rows, Shown, Standings
 from robomme_interference_data.evaluate.run.row import Rollout, row_of
 from robomme_interference_data.evaluate.score.config import Expected, Settings
-from robomme_interference_data.evaluate.score.scoring import score
+from robomme_interference_data.evaluate.score.scoring import score as score_rows
 from robomme_interference_data.schema.codec import arrow_schema, to_table
+from robomme_interference_data.schema.conditions import NO_HISTORY
+from robomme_interference_data.storage.files import write_json
 from robomme_interference_data.storage.text import canonical_json
 
 BOARD, SYSTEM = "tiny", "my-memory"
@@ -39,7 +45,7 @@ def published(run: Path) -> Files:
     """Return the files of `publish-results` that rules read: without pictures, which are slow."""
     names = (RUN_HEADER, RUN_RECORD, *RUN_TABLES)
     files = {name: (run / name).read_bytes() for name in names}
-    scored = score(Settings(rows=(run,), expected=Expected.OBSERVED))
+    scored = score_rows(Settings(rows=(run,), expected=Expected.OBSERVED))
     return files | _stated(files, scored.tables["main"].csv().encode())
 
 
@@ -67,7 +73,12 @@ def changed(
         (folder / name).write_bytes(new[name])
     rates = files[RATES]
     with suppress(ValueError):  # rows that no score takes
-        rates = score(Settings((folder,), expected=Expected.OBSERVED)).tables["main"].csv().encode()
+        rates = (
+            score_rows(Settings((folder,), expected=Expected.OBSERVED))
+            .tables["main"]
+            .csv()
+            .encode()
+        )
     return new | _stated(new, rates)
 
 
@@ -97,3 +108,32 @@ def write_board(path: Path, *submissions: dict[str, Any], **content: Any) -> Pat
 def use_tiny(monkeypatch: Any) -> None:
     """Let worlds play the tiny buffer set."""
     monkeypatch.setenv(worlds.BUFFER_SET, str(GOLDEN))
+
+
+def made_up(folder: Path) -> Leaderboard:
+    """Return a board of made-up rows: two systems are ranked, beside a control and an example."""
+    rows = [row for row in scoring.rows() if row.status != "error"]
+    for place, family in enumerate(scoring.FAMILIES):
+        for episode in range(scoring.EPISODES):
+            letter = "f" if place or episode else "s"
+            rows.append(scoring.row("guess", NO_HISTORY, family, episode, letter))
+    path = scoring.write_parquet(folder / "rows.parquet", rows)
+    standings = {
+        scoring.BASE: Standing.SUBMISSION,
+        scoring.RETRIEVAL: Standing.SUBMISSION,
+        scoring.OWN: Standing.EXAMPLE,
+        "guess": Standing.CONTROL,
+    }
+    shown = {name: Shown(name, standing, None) for name, standing in standings.items()}
+    board = Board(BOARD, "tabletop")
+    return Leaderboard((Standings(board, None, [Rows((path,))], shown),), ())
+
+
+GOLDEN_JSON = Path(__file__).parents[1] / "golden" / "leaderboard" / "leaderboard.json"
+
+
+def make_golden_leaderboard(folder: Path) -> None:
+    """Write the golden file of a site's data."""
+    with TemporaryDirectory() as name:
+        made = made_up(Path(name))
+        write_json(folder / GOLDEN_JSON.name, made.to_dict())
