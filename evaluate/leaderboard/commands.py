@@ -10,7 +10,7 @@ from robomme_interference_data.cli.console import check_output, echo, print_stat
 from robomme_interference_data.errors import InvalidOptionError, PublishError, counted, named
 
 if TYPE_CHECKING:
-    from .rules import Problem
+    from .rules import BrokenRule
 
 _MEMORY_BYTES = 8 << 30
 """Memory for rows, which come from strangers, as in `score`."""
@@ -159,7 +159,7 @@ def leaderboard(
     print_status(f"Page: {out / PAGE}")
 
 
-def _print_problems(problems: "Sequence[Problem]") -> None:
+def _print_problems(problems: "Sequence[BrokenRule]") -> None:
     for problem in problems:
         print_status(str(problem))
         print_status(f"  {problem.rule.fix}")

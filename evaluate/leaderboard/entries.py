@@ -39,7 +39,7 @@ class MemoryKind(StrEnum):
     TEXT = "text"
 
 
-class Standing(StrEnum):
+class BoardStanding(StrEnum):
     """Why rows are on a board, best supported first; only a submission is ranked."""
 
     SUBMISSION = "submission"
@@ -49,7 +49,9 @@ class Standing(StrEnum):
     UNVERIFIED = "unverified"
 
 
-_UNRANKED = [each for each in Standing if each not in (Standing.SUBMISSION, Standing.PAPER)]
+_UNRANKED = [
+    each for each in BoardStanding if each not in (BoardStanding.SUBMISSION, BoardStanding.PAPER)
+]
 
 
 @dataclass(frozen=True)
@@ -173,7 +175,8 @@ def _parse(text: str, path: Path) -> Entries:
     names = [board.name for board in entries.boards]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise FormatError.damaged(path, f"two boards are called {twice!r}")
-    for entry in (*entries.references, *entries.submissions):
+    listed_on: tuple[Reference | Submission, ...] = (*entries.references, *entries.submissions)
+    for entry in listed_on:
         if entry.board not in names:
             known = ", ".join(names) or "none"
             raise FormatError.damaged(path, f"board {entry.board!r}; the boards are: {known}")

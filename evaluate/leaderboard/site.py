@@ -14,11 +14,11 @@ from robomme_interference_data.evaluate.score.rows.values import Row
 from robomme_interference_data.storage.files import write_json, write_text
 from robomme_interference_data.viz.tables import Columns, Table
 
-from .entries import Board, Entries, Standing
+from .entries import Board, BoardStanding, Entries
 from .page import slug, write_page
 from .published import Grid, open_case
-from .rules import RULES, Problem, check
-from .standings import Rows, Shown, Standings
+from .rules import RULES, BrokenRule, check
+from .standings import BoardRows, BoardSystem, Standings
 
 DATA = "leaderboard.json"
 PAGE = "index.html"
@@ -29,7 +29,7 @@ class Leaderboard:
     """All boards that have rows, and what was not accepted."""
 
     boards: tuple[Standings, ...]
-    problems: tuple[Problem, ...]
+    problems: tuple[BrokenRule, ...]
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain values, for JSON."""
@@ -61,7 +61,7 @@ def _rounded(value: Any) -> Any:
     return [_rounded(inner) for inner in value] if isinstance(value, list) else value
 
 
-def check_all(entries: Entries) -> list[Problem]:
+def check_all(entries: Entries) -> list[BrokenRule]:
     """Return what does not hold of any submission."""
     return [problem for board in entries.boards for problem in _gather(entries, board).problems]
 
@@ -73,7 +73,7 @@ def make_leaderboard(entries: Entries, released: Sequence[Path] = ()) -> Leaderb
         entries: The file of the leaderboard.
         released: Files with rows of the paper's systems, for the board of the official simulator.
     """
-    boards, problems = list[Standings](), list[Problem]()
+    boards, problems = list[Standings](), list[BrokenRule]()
     papers = [board.name for board in entries.boards if board.simulator == OFFICIAL]
     if released and not papers:
         raise FormatError(
@@ -115,9 +115,9 @@ class _Gathered:
     """What is on a board, and why submissions are not."""
 
     grid: Grid | None
-    rows: list[Rows] = field(default_factory=list)
-    shown: dict[str, Shown] = field(default_factory=dict)
-    problems: list[Problem] = field(default_factory=list)
+    rows: list[BoardRows] = field(default_factory=list)
+    shown: dict[str, BoardSystem] = field(default_factory=dict)
+    problems: list[BrokenRule] = field(default_factory=list)
 
 
 def _gather(entries: Entries, board: Board, released: tuple[Path, ...] = ()) -> _Gathered:
@@ -125,24 +125,24 @@ def _gather(entries: Entries, board: Board, released: tuple[Path, ...] = ()) -> 
     gathered = _Gathered(Grid.of(entries, board))
     for reference in [each for each in entries.references if each.board == board.name]:
         paths = tuple(Path(entries.locate(path)) for path in reference.rows)
-        rows = Rows(paths, reference.system)
-        _add(gathered, board, rows, Standing(reference.standing), reference.trained_on)
+        rows = BoardRows(paths, reference.system)
+        _add(gathered, board, rows, BoardStanding(reference.standing), reference.trained_on)
     if released:
-        _add(gathered, board, Rows(released), Standing.PAPER, None)
+        _add(gathered, board, BoardRows(released), BoardStanding.PAPER, None)
     for submission in [each for each in entries.submissions if each.board == board.name]:
         system = submission.system
         case = open_case(entries, submission, gathered.grid, frozenset(gathered.shown))
         if problems := check(case):
             gathered.problems += problems
             continue
-        gathered.rows.append(Rows(tuple(each.folder for each in case.results)))
-        shown = Shown(system, Standing.SUBMISSION, submission.trained_on, case)
+        gathered.rows.append(BoardRows(tuple(each.folder for each in case.results)))
+        shown = BoardSystem(system, BoardStanding.SUBMISSION, submission.trained_on, case)
         gathered.shown[system] = shown
     return gathered
 
 
 def _add(
-    gathered: _Gathered, board: Board, rows: Rows, standing: Standing, trained: str | None
+    gathered: _Gathered, board: Board, rows: BoardRows, standing: BoardStanding, trained: str | None
 ) -> None:
     """Add rows that are not ranked, whose simulator and buffer set are those of the board."""
     read = read_rows(rows.paths, [] if rows.system is None else [rows.system])
@@ -160,7 +160,7 @@ def _add(
             )
     gathered.rows.append(rows)
     for system in read.names("system"):
-        gathered.shown.setdefault(system, Shown(system, standing, trained))
+        gathered.shown.setdefault(system, BoardSystem(system, standing, trained))
 
 
 _COLUMNS: Columns = {

@@ -1,7 +1,6 @@
 """A board as data: its systems with their numbers, from all of its rows scored together."""
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
@@ -14,7 +13,7 @@ from robomme_interference_data.errors import InterferenceError
 from robomme_interference_data.evaluate.ceiling import ceiling, chance
 from robomme_interference_data.evaluate.run.config import CeilingConfig
 from robomme_interference_data.evaluate.score.config import Expected, Settings
-from robomme_interference_data.evaluate.score.outcomes import STATUSES, Outcomes
+from robomme_interference_data.evaluate.score.outcomes import Outcomes
 from robomme_interference_data.evaluate.score.partners import ceilings_of, share_weights
 from robomme_interference_data.evaluate.score.scoring import Score, score
 from robomme_interference_data.evaluate.score.tables.cells import SuccessCell
@@ -26,14 +25,16 @@ from robomme_interference_data.schema.conditions import NO_HISTORY, in_order
 from robomme_interference_data.stats.bootstrap import Interval
 from robomme_interference_data.stats.significance import holm
 
-from .entries import Board, Standing
+from .entries import Board, BoardStanding
+from .plain_values import interval_values, known, letter, mean, rate_of_cell, stated
 from .published import Case, Grid, ranked_by
 
-_DRAWS = 2000
+_DRAWS = 100
+"""Bootstrap samples: no number of a board depends on them."""
 
 
 @dataclass(frozen=True)
-class Shown:
+class BoardSystem:
     """A system of a board, before its rows are scored.
 
     Attributes:
@@ -44,13 +45,13 @@ class Shown:
     """
 
     system: str
-    standing: Standing
+    standing: BoardStanding
     trained_on: str | None
     case: Case | None = None
 
 
 @dataclass(frozen=True)
-class Rows:
+class BoardRows:
     """Rows of a board: files or folders, and the name of the system in those that state none."""
 
     paths: tuple[Path, ...]
@@ -71,7 +72,11 @@ class Standings:
     """
 
     def __init__(
-        self, board: Board, grid: Grid | None, rows: Sequence[Rows], shown: Mapping[str, Shown]
+        self,
+        board: Board,
+        grid: Grid | None,
+        rows: Sequence[BoardRows],
+        shown: Mapping[str, BoardSystem],
     ):
         self.board = board
         self.grid = grid
@@ -109,14 +114,14 @@ class Standings:
                 "trained_on": shown.trained_on,
                 "memory": facts.memory,
                 "retrieval": facts.retrieval,
-                **_stated(shown.case),
+                **stated(shown.case),
                 "success": {
-                    condition: _rate(cell)
+                    condition: rate_of_cell(cell)
                     for condition in self.conditions
                     if (cell := self._cells.get((system, condition, "")))
                 },
                 "families": {
-                    family: _rate(cell)
+                    family: rate_of_cell(cell)
                     for family in self.outcomes.families
                     if (cell := self._cells.get((system, self.last, family)))
                 },
@@ -131,16 +136,16 @@ class Standings:
 
     def _order(self, record: Mapping[str, Any]) -> tuple[Any, ...]:
         last = record["success"].get(self.last)
-        known = last is not None
-        ranked = record["standing"] == Standing.SUBMISSION
-        return (not known, -last["rate"] if known else 0, not ranked, record["system"])
+        rate = -1.0 if last is None else last["rate"]
+        ranked = record["standing"] == BoardStanding.SUBMISSION
+        return (-rate, not ranked, record["system"])
 
     def _ranks(self) -> dict[str, dict[str, Any]]:
         """Return rank and ties of the submissions, by the paired tests of all pairs."""
         systems = [
             name
             for name, shown in self.shown.items()
-            if shown.standing is Standing.SUBMISSION and self._ran_last(name)
+            if shown.standing is BoardStanding.SUBMISSION and self._ran_last(name)
         ]
         if not systems:
             return {}
@@ -167,7 +172,7 @@ class Standings:
         return {
             name: self.last if self._ran_last(name) else NO_HISTORY
             for name, shown in self.shown.items()
-            if shown.standing is Standing.CONTROL
+            if shown.standing is BoardStanding.CONTROL
             if self._ran_last(name) or (name, NO_HISTORY, "") in self._cells
         }
 
@@ -189,8 +194,8 @@ class Standings:
         found: dict[str, dict[str, Any]] = {}
         for ((system, control), pairs), p in zip(compared.items(), ps, strict=True):
             if pairs.n:
-                values = {"n": pairs.n, "p_holm": _known(p), "paired": pairs.paired}
-                found.setdefault(system, {})[control] = _interval(pairs.change) | values
+                values = {"n": pairs.n, "p_holm": known(p), "paired": pairs.paired}
+                found.setdefault(system, {})[control] = interval_values(pairs.change) | values
         return found
 
     def _ran_last(self, system: str) -> bool:
@@ -206,7 +211,7 @@ class Standings:
                 continue
             if (row["against_system"], row["against_condition"]) == (system, LESSON_ONLY):
                 interval = Interval(row["difference"], row["low"], row["high"])
-                found["fall"] = _interval(interval) | {"n": row["n"], "p_holm": row["p_holm"]}
+                found["fall"] = interval_values(interval) | {"n": row["n"], "p_holm": row["p_holm"]}
             elif row["against_condition"] == NO_HISTORY and row["retention"] is not None:
                 low, high = row["retention_low"], row["retention_high"]
                 found["retention"] = {"value": row["retention"], "low": low, "high": high}
@@ -236,9 +241,9 @@ class Standings:
         """Success of guessing, with nothing seen of the past; None if unknown."""
         if self.grid is not None:
             queries = map(self.grid.buffer_set.query, self.grid.buffer_set.episode_ids)
-            return _mean(chance(query, {}) for query in queries)
-        return _mean(
-            _known(cell.chance)
+            return mean(chance(query, {}) for query in queries)
+        return mean(
+            known(cell.chance)
             for (_, condition, part), cell in self._cells.items()
             if condition == self.last and not part
         )
@@ -279,65 +284,3 @@ class Standings:
 
 
 _UNRANKED = {"rank": None, "rank_low": None, "rank_high": None, "tied": False}
-
-
-def letter(counts: Sequence[int]) -> str:
-    """Return the outcome of an episode's rollouts in a letter, given their number by status.
-
-    `s` all succeed, `f` none, `t` none and all time out, `e` all broke, `1` to `9` the tenths that
-    succeed, `-` there are none.
-    """
-    count = dict(zip(map(str, STATUSES), counts, strict=True))
-    counted = count["success"] + count["fail"] + count["timeout"]
-    if not counted:
-        return "e" if count["error"] else "-"
-    if count["success"] in (0, counted):
-        failed = "t" if count["timeout"] == counted else "f"
-        return "s" if count["success"] else failed
-    return str(min(max(round(10 * count["success"] / counted), 1), 9))
-
-
-def _stated(case: Case | None) -> dict[str, Any]:
-    """Return what a submission states, and where its results are."""
-    if case is None:
-        return {"remembers": None, "parameters": None, "probe": None, "runs": []}
-    return {
-        "remembers": case.submission.memory,
-        "parameters": case.submission.parameters,
-        "probe": next((each.header.probed for each in case.results), None),
-        "runs": [
-            {
-                "results": each.run.results,
-                "checkpoint": each.run.checkpoint,
-                "checkpoint_sha256": each.run.checkpoint_sha256,
-                "links": dict(each.links),
-            }
-            for each in case.results
-        ],
-    }
-
-
-def _rate(cell: SuccessCell) -> dict[str, Any]:
-    low, high = cell.interval
-    return {
-        "n": cell.n,
-        "rate": cell.rate,
-        "low": low,
-        "high": high,
-        "training_runs": cell.runs,
-        "complete": cell.complete,
-    }
-
-
-def _interval(interval: Interval) -> dict[str, Any]:
-    value, low, high = map(_known, interval)
-    return {"value": value, "low": low, "high": high}
-
-
-def _known(value: float | None) -> float | None:
-    return None if value is None or math.isnan(value) else value
-
-
-def _mean(values: Iterable[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if known else None

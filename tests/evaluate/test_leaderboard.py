@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,8 +10,10 @@ import pytest
 import yaml
 from support import boards
 from support.boards import BOARD, SYSTEM, Files
+from support.browser import open_page
 from support.hub_server import HubServer
 from support.messages import raises
+from support.scoring import RELEASED, ROOT
 
 from robomme_interference_data.errors import FormatError, InvalidOptionError
 from robomme_interference_data.evaluate.leaderboard.entries import (
@@ -19,6 +22,7 @@ from robomme_interference_data.evaluate.leaderboard.entries import (
     add_submission,
     read_entries,
 )
+from robomme_interference_data.evaluate.leaderboard.plain_values import letter
 from robomme_interference_data.evaluate.leaderboard.published import RATES, ranked_by
 from robomme_interference_data.evaluate.leaderboard.rules import RULES
 from robomme_interference_data.evaluate.leaderboard.site import (
@@ -26,7 +30,6 @@ from robomme_interference_data.evaluate.leaderboard.site import (
     make_leaderboard,
     write_site,
 )
-from robomme_interference_data.evaluate.leaderboard.standings import letter
 
 Run = Callable[..., tuple[int, str, str]]
 REPOSITORY = "someone/results"
@@ -317,6 +320,81 @@ def test_the_written_json(tmp_path: Path) -> None:
     # 7 of 12 against 1: the guess fails wherever the system fails.
     difference = first["differences"]["guess"]
     assert (difference["n"], difference["value"]) == (12, 0.5)
+
+
+@pytest.mark.slow
+def test_the_leaderboard_of_this_repository(tmp_path: Path, run: Run) -> None:
+    """Its rows break rules 2 and 6, so all are references."""
+    path = ROOT / "docs" / "leaderboard" / "results.yaml"
+    words = ["leaderboard", path, "--out", tmp_path]
+    if RELEASED.exists():
+        words += ["--released", RELEASED]
+    code, _, err = run(*words)
+    assert code == 0, err
+    data = json.loads((tmp_path / "leaderboard.json").read_text(encoding="utf-8"))
+    assert data["refused"] == []
+    boards_by_name = {board["board"]: board for board in data["boards"]}
+    assert [*boards_by_name] == ["robomme", "tabletop", "tabletop-training", "questions"]
+    for board in data["boards"]:
+        assert {system["rank"] for system in board["systems"]} == {None}
+    # docs/results/training.md: 5.1% trained on lessons alone, 64.7% with interference.
+    rates = {
+        system["system"]: (system["trained_on"], round(system["success"]["k7"]["rate"], 3))
+        for system in boards_by_name["tabletop-training"]["systems"]
+    }
+    assert rates["acts-k0"] == ("other", 0.051)
+    assert rates["acts-mixture"] == ("interference", 0.647)
+    standings = {
+        system["system"]: system["standing"] for system in boards_by_name["robomme"]["systems"]
+    }
+    assert standings["oracle"] == "control"
+    if RELEASED.exists():
+        assert standings["retrieval-framesamp-modul"] == "paper"
+
+
+@pytest.mark.slow
+def test_the_page_in_a_browser(tmp_path: Path) -> None:
+    made = boards.made_up(tmp_path)
+    note = "<script>document.title = 'bad'</script>"
+    made.boards[0].board = replace(made.boards[0].board, note=note)
+    write_site(made, tmp_path / "site")
+    page_file = tmp_path / "site" / "index.html"
+    with open_page() as page:
+        for width in (390, 1280):
+            page.events.clear()
+            page.call(
+                "Emulation.setDeviceMetricsOverride",
+                width=width,
+                height=800,
+                deviceScaleFactor=1,
+                mobile=width < 500,
+            )
+            page.open(page_file)
+            assert page.requests() == [page_file.resolve().as_uri()] and not page.complaints()
+            assert page.run("document.documentElement.scrollWidth") <= width
+            assert page.run("document.title") == "RoboMME-Interference: leaderboard"
+        names = "[...document.querySelectorAll('#table-tiny tbody th')].map(e => e.textContent)"
+        first = page.run(names)
+        assert first[0] == "Retrieval-FrameSamp-Modul" and len(first) == 4
+        # The second column of rates is that of no-history; the best of it is at the end.
+        page.click("#table-tiny thead th:nth-child(5) button")
+        assert page.run(names)[:2] != first[:2]
+        page.choose("#table-tiny select[name=standing]", "control")
+        assert page.run(names) == ["Guess"]
+        rows = "document.querySelectorAll('#picture-tiny canvas').length"
+        assert page.run(rows) == 2  # that ran k7
+        widths = "document.querySelector('#picture-tiny canvas').clientWidth"
+        whole = page.run(widths)
+        page.run(
+            "{ const e = document.querySelector('#picture-tiny select[name=family]');"
+            "e.value = 'MoveCube'; e.dispatchEvent(new Event('input')); }"
+        )
+        assert page.run(widths) < whole
+        page.run(
+            "{ const e = document.querySelector('#picture-tiny select[name=condition]');"
+            "e.value = 'no-history'; e.dispatchEvent(new Event('input')); }"
+        )
+        assert page.run(rows) == 3
 
 
 # --- the command that adds a submission ----------------------------------------------------------

@@ -14,10 +14,14 @@ from support import runs, scoring, worlds
 from support.buffer_sets import GOLDEN
 
 from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD, RUN_TABLES
-from robomme_interference_data.evaluate.leaderboard.entries import Board, Standing
+from robomme_interference_data.evaluate.leaderboard.entries import Board, BoardStanding
 from robomme_interference_data.evaluate.leaderboard.published import CARD, RATES
 from robomme_interference_data.evaluate.leaderboard.site import Leaderboard
-from robomme_interference_data.evaluate.leaderboard.standings import Rows, Shown, Standings
+from robomme_interference_data.evaluate.leaderboard.standings import (
+    BoardRows,
+    BoardSystem,
+    Standings,
+)
 from robomme_interference_data.evaluate.run.row import Rollout, row_of
 from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.scoring import score as score_rows
@@ -119,14 +123,14 @@ def made_up(folder: Path) -> Leaderboard:
             rows.append(scoring.row("guess", NO_HISTORY, family, episode, letter))
     path = scoring.write_parquet(folder / "rows.parquet", rows)
     standings = {
-        scoring.BASE: Standing.SUBMISSION,
-        scoring.RETRIEVAL: Standing.SUBMISSION,
-        scoring.OWN: Standing.EXAMPLE,
-        "guess": Standing.CONTROL,
+        scoring.BASE: BoardStanding.SUBMISSION,
+        scoring.RETRIEVAL: BoardStanding.SUBMISSION,
+        scoring.OWN: BoardStanding.EXAMPLE,
+        "guess": BoardStanding.CONTROL,
     }
-    shown = {name: Shown(name, standing, None) for name, standing in standings.items()}
+    shown = {name: BoardSystem(name, standing, None) for name, standing in standings.items()}
     board = Board(BOARD, "tabletop")
-    return Leaderboard((Standings(board, None, [Rows((path,))], shown),), ())
+    return Leaderboard((Standings(board, None, [BoardRows((path,))], shown),), ())
 
 
 GOLDEN_JSON = Path(__file__).parents[1] / "golden" / "leaderboard" / "leaderboard.json"
