@@ -379,7 +379,7 @@ def test_the_page_in_a_browser(tmp_path: Path) -> None:
         # The second column of rates is that of no-history; the best of it is at the end.
         page.click("#table-tiny thead th:nth-child(5) button")
         assert page.run(names)[:2] != first[:2]
-        page.choose("#table-tiny select[name=standing]", "control")
+        page.choose("#table-tiny select[name='standing']", "control")
         assert page.run(names) == ["Guess"]
         rows = "document.querySelectorAll('#picture-tiny canvas').length"
         assert page.run(rows) == 2  # that ran k7
