@@ -4,6 +4,7 @@ A submission is a few lines of this file, which name a repository of `publish-re
 rows do not state. Paths are relative to the file's folder.
 """
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -16,6 +17,8 @@ from robomme_interference_data.errors import FormatError, InvalidOptionError
 from robomme_interference_data.schema.codec import from_dict, to_dict
 from robomme_interference_data.storage.files import write_text
 from robomme_interference_data.storage.text import read_text
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 _MAX_BYTES = 1 << 20
 """Some thousand submissions."""
@@ -58,7 +61,7 @@ _UNRANKED = [
 class Board:
     """Systems that are compared with each other: on one buffer set, in one simulator."""
 
-    name: Annotated[str, "Name of the board, such as `tabletop`."]
+    name: Annotated[str, "Name of the board, of letters, digits, `-`, `_` and `.`."]
     simulator: Annotated[str, "The simulator in its rows; boards of two simulators never mix."]
     buffer_set: Annotated[
         str | None,
@@ -66,6 +69,11 @@ class Board:
         "can be checked against the buffer set.",
     ] = None
     note: Annotated[str | None, "What readers must know, in a sentence or two."] = None
+
+    def __post_init__(self) -> None:
+        if not _NAME.fullmatch(self.name):  # it is part of a file's name
+            expected = "up to 64 letters, digits, '-', '_' and '.'"
+            raise InvalidOptionError.expected("name", self.name, expected)
 
 
 @dataclass(frozen=True)
@@ -155,7 +163,8 @@ def read_entries(path: Path) -> Entries:
 def _parse(text: str, path: Path) -> Entries:
     try:
         content = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+    # Beside its own errors: a date that does not exist or is too early, and deep nesting.
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         raise FormatError.damaged(path, f"no valid YAML: {error}") from None
     if not isinstance(content, Mapping):
         raise FormatError.damaged(path, "expected boards, references and submissions")

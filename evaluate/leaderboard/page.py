@@ -33,7 +33,6 @@ def write_page(data: Mapping[str, Any], path: Path, opened_in: Path) -> None:
         "percent": percent,
         "points": points,
         "p": p_text,
-        "slug": slug,
         "href": lambda address: _href(address, opened_in),
         "pinned": lambda text: text.partition("@")[0],
     }
@@ -41,11 +40,6 @@ def write_page(data: Mapping[str, Any], path: Path, opened_in: Path) -> None:
         __package__, "leaderboard.html.j2", values, what=_WHAT, autoescape=True, filters=filters
     )
     write_text(path, html)
-
-
-def slug(text: str) -> str:
-    """Return a name as part of a file's name and of an address."""
-    return "".join(c if c.isalnum() or c in "-_." else "-" for c in text)
 
 
 def _shared(name: str) -> str:
@@ -76,7 +70,7 @@ def _groups(board: Mapping[str, Any]) -> dict[str, Any]:
 def _outcomes(board: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the picture of a board shows."""
     return {
-        "id": slug(board["board"]),
+        "id": board["board"],
         "episodes": board["episodes"],
         "systems": [
             {name: system[name] for name in ("system", "name", "standing", "outcomes")}

@@ -15,7 +15,7 @@ from robomme_interference_data.storage.files import write_json, write_text
 from robomme_interference_data.viz.tables import Columns, Table
 
 from .entries import Board, BoardStanding, Entries
-from .page import slug, write_page
+from .page import write_page
 from .published import Grid, open_case
 from .rules import RULES, BrokenRule, check
 from .standings import BoardRows, BoardSystem, Standings
@@ -96,7 +96,7 @@ def write_site(made: Leaderboard, out: Path) -> dict[str, Any]:
     with TemporaryDirectory(dir=out, prefix=".", suffix=".partial") as name:
         folder = Path(name)
         for board in made.boards:
-            write_text(folder / "rows" / f"{slug(board.board.name)}.csv", _rows_table(board).csv())
+            write_text(folder / "rows" / f"{board.board.name}.csv", _rows_table(board).csv())
         write_json(folder / DATA, data)
         write_page(data, folder / PAGE, out)
         shutil.rmtree(out / "rows", ignore_errors=True)  # of boards that are gone

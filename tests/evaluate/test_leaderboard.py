@@ -457,18 +457,41 @@ def test_an_entry_is_not_added_in_the_middle(tmp_path: Path) -> None:
     assert path.read_text() == text
 
 
+WRONG_FIELDS = (
+    "boards: 3",
+    "boards:\n- name: a",
+    "boards:\n- name: a\n  simulator: b\n  more: c",
+    "boards: []\nreferences:\n- {board: a, rows: [b], standing: submission}",
+    "boards: []\nother: 1",
+)
+
+
+def test_the_json_schema() -> None:
+    schema = json.loads(boards.SCHEMA.read_text(encoding="utf-8"))
+    assert schema == boards.json_schema()
+    jsonschema = pytest.importorskip("jsonschema")
+    check = jsonschema.Draft202012Validator(schema)
+    whole = yaml.safe_load((ROOT / "docs" / "leaderboard" / "results.yaml").read_text("utf-8"))
+    assert check.is_valid(whole)
+    assert check.is_valid({**whole, "submissions": [boards.submission("a/b@" + "0" * 40)]})
+    assert not check.is_valid({**whole, "submissions": [boards.submission("a", memory="good")]})
+    assert not any(check.is_valid(yaml.safe_load(text)) for text in WRONG_FIELDS)
+
+
 @pytest.mark.parametrize(
     "text",
     [
+        *WRONG_FIELDS,
         "boards: [",
         "- a",
-        "boards: 3",
-        "boards:\n- name: a",
-        "boards:\n- name: a\n  simulator: b\n  more: c",
+        "boards:\n- {name: a b, simulator: c}",
+        "boards: 2026-13-45",
+        "boards: 0001-01-01T00:00:00+23:59",
+        "boards: &x [*x]",
+        "? [a]\n: b",
+        pytest.param("[" * 5000, id="deep"),
         "boards:\n- &a {name: a, simulator: b}\n- *a",
         "boards: []\nreferences:\n- {board: a, rows: [b], standing: control}",
-        "boards: []\nreferences:\n- {board: a, rows: [b], standing: submission}",
-        "boards: []\nother: 1",
     ],
 )
 def test_a_wrong_file(tmp_path: Path, text: str) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, get_args, get_origin, get_type_hints
 
 import pyarrow.parquet as pq
 import yaml
@@ -14,7 +14,14 @@ from support import runs, scoring, worlds
 from support.buffer_sets import GOLDEN
 
 from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD, RUN_TABLES
-from robomme_interference_data.evaluate.leaderboard.entries import Board, BoardStanding
+from robomme_interference_data.evaluate.leaderboard.entries import (
+    Board,
+    BoardStanding,
+    MemoryKind,
+    Reference,
+    Submission,
+    TrainedOn,
+)
 from robomme_interference_data.evaluate.leaderboard.published import CARD, RATES
 from robomme_interference_data.evaluate.leaderboard.site import Leaderboard
 from robomme_interference_data.evaluate.leaderboard.standings import (
@@ -25,7 +32,7 @@ from robomme_interference_data.evaluate.leaderboard.standings import (
 from robomme_interference_data.evaluate.run.row import Rollout, row_of
 from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.scoring import score as score_rows
-from robomme_interference_data.schema.codec import arrow_schema, to_table
+from robomme_interference_data.schema.codec import arrow_schema, descriptions, to_table
 from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.storage.files import write_json
 from robomme_interference_data.storage.text import canonical_json
@@ -133,11 +140,69 @@ def made_up(folder: Path) -> Leaderboard:
     return Leaderboard((Standings(board, None, [BoardRows((path,))], shown),), ())
 
 
+SCHEMA = Path(__file__).parents[2] / "evaluate" / "leaderboard" / "results.schema.json"
+
+_CHOICES = {
+    "memory": MemoryKind,
+    "trained_on": TrainedOn,
+    "standing": ("control", "example", "unverified"),
+}
+_TYPES = {str: "string", int: "integer"}
+
+
+def json_schema() -> dict[str, Any]:
+    """Return the JSON schema of the file of a leaderboard, for editors and other programs."""
+    lists = {"boards": Board, "references": Reference, "submissions": Submission}
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "The file of a leaderboard",
+        "type": "object",
+        "required": ["boards"],
+        "additionalProperties": False,
+        "properties": {
+            name: {"type": ["array", "null"], "items": _object(record)}
+            for name, record in lists.items()
+        },
+    }
+
+
+def _object(record: type) -> dict[str, Any]:
+    hints, texts = get_type_hints(record), descriptions(record)
+    optional = {name for name, hint in hints.items() if isinstance(None, _class_of(hint))}
+    return {
+        "type": "object",
+        "required": [name for name in hints if name not in optional],
+        "additionalProperties": False,
+        "properties": {
+            name: _value(name, hint) | {"description": texts[name]} for name, hint in hints.items()
+        },
+    }
+
+
+def _class_of(hint: Any) -> Any:
+    """Return a hint as `isinstance` takes it."""
+    return tuple if get_origin(hint) is tuple else hint
+
+
+def _value(name: str, hint: Any) -> dict[str, Any]:
+    if get_origin(hint) is tuple:
+        item = get_args(hint)[0]
+        items = {"type": "string"} if item is str else _object(item)
+        return {"type": "array", "minItems": 1, "items": items}
+    kinds = [kind for kind in (get_args(hint) or (hint,)) if kind is not type(None)]
+    types = [_TYPES[kind] for kind in kinds] + ["null"] * (len(get_args(hint)) > 1)
+    value: dict[str, Any] = {"type": types[0] if len(types) == 1 else types}
+    if name in _CHOICES:
+        value["enum"] = [*map(str, _CHOICES[name])] + [None] * (len(types) > 1)
+    return value
+
+
 GOLDEN_JSON = Path(__file__).parents[1] / "golden" / "leaderboard" / "leaderboard.json"
 
 
 def make_golden_leaderboard(folder: Path) -> None:
-    """Write the golden file of a site's data."""
+    """Write the golden file of a site's data, and the schema of the file that it is made from."""
+    write_json(SCHEMA, json_schema())
     with TemporaryDirectory() as name:
         made = made_up(Path(name))
         write_json(folder / GOLDEN_JSON.name, made.to_dict())
