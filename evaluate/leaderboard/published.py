@@ -89,14 +89,12 @@ class Results:
         folder: Where they are on this machine.
         header: Its `run.json`.
         rows: The rows that count, in the order of the record.
-        page: Address of the repository at the commit; None for a folder.
     """
 
     def __init__(self, run: PublishedRun, location: str):
         self.run = run
         self.fault = ""
         self.paths: frozenset[str] = frozenset()
-        self.page: str | None = None
         try:
             self._open(location)
         except (InterferenceError, OSError) as error:
@@ -110,9 +108,12 @@ class Results:
                     f"{location} is not namespace/name@ and the 40 digits of a commit"
                 )
             self.paths = frozenset(files.sizes())
-            self.page = f"{HubCall(files.repo_id).page}/blob/{files.commit}"
+            page = HubCall(files.repo_id).page
+            self._files_at = f"{page}/blob/{files.commit}"
+            self._folders_at = f"{page}/tree/{files.commit}"
         else:
             self.paths = frozenset(all_files(Path(location)))
+            self._files_at = self._folders_at = files.location
         if missing := [name for name in NEEDED if name not in self.paths]:
             raise MissingFileError(f"{location} lacks {', '.join(missing)}")
         self.folder = files.snapshot(*NEEDED)
@@ -122,15 +123,12 @@ class Results:
     @cached_property
     def links(self) -> Mapping[str, str]:
         """What readers open, by name, as addresses or paths."""
-        wanted = {"rows": RUN_TABLES[0], "card": CARD, "report": REPORT}
-        videos = sorted({row.video for row in self.rows if row.video} & self.paths)
-        if videos:
-            wanted["videos"] = videos[0].partition("/")[0]
-        base = self.page or str(self.folder)
-        links = {name: f"{base}/{path}" for name, path in wanted.items() if name == "videos"}
-        links |= {name: f"{base}/{path}" for name, path in wanted.items() if path in self.paths}
-        if self.page is not None and videos:  # a folder, which the Hub shows elsewhere
-            links["videos"] = links["videos"].replace("/blob/", "/tree/")
+        files = {"rows": RUN_TABLES[0], "card": CARD, "report": REPORT}
+        links = {
+            name: f"{self._files_at}/{path}" for name, path in files.items() if path in self.paths
+        }
+        if videos := sorted({row.video for row in self.rows if row.video} & self.paths):
+            links["videos"] = f"{self._folders_at}/{videos[0].partition('/')[0]}"
         return links
 
 

@@ -23,7 +23,7 @@ from robomme_interference_data.evaluate.leaderboard.entries import (
     read_entries,
 )
 from robomme_interference_data.evaluate.leaderboard.plain_values import letter
-from robomme_interference_data.evaluate.leaderboard.published import RATES, ranked_by
+from robomme_interference_data.evaluate.leaderboard.published import RATES, Results, ranked_by
 from robomme_interference_data.evaluate.leaderboard.rules import RULES
 from robomme_interference_data.evaluate.leaderboard.site import (
     check_all,
@@ -253,6 +253,23 @@ def test_a_leaderboard(listed: Path, hub: HubServer, tmp_path: Path, run: Run) -
     before = {path: path.read_bytes() for path in (tmp_path / "site").rglob("*") if path.is_file()}
     assert run("leaderboard", listed, "--out", tmp_path / "site")[0] == 0
     assert before == {path: path.read_bytes() for path in before}
+
+
+def test_videos_are_linked(good: Files, hub: HubServer, tmp_path: Path) -> None:
+    def filmed(row: dict[str, Any]) -> dict[str, Any]:
+        return row | {"video": "videos/a.mp4"} if row["condition"] == "k7" else row
+
+    files = boards.changed(good, tmp_path / "filmed", row=filmed)
+    names = {"rows": "rollouts.parquet", "card": "README.md"}
+    for more, expected in (({}, names), ({"videos/a.mp4": b""}, {**names, "videos": "videos"})):
+        commit = hub.push(f"datasets/{REPOSITORY}", files | more)
+        location = f"{REPOSITORY}@{commit}"
+        links = Results(PublishedRun(location, "weights", boards.SHA256), location).links
+        page = f"{hub.endpoint}/datasets/{REPOSITORY}"
+        assert links == {
+            name: f"{page}/{'tree' if name == 'videos' else 'blob'}/{commit}/{path}"
+            for name, path in expected.items()
+        }
 
 
 def test_results_of_other_programs_are_not_ranked(tmp_path: Path, made: Path, run: Run) -> None:
