@@ -255,6 +255,21 @@ def test_a_leaderboard(listed: Path, hub: HubServer, tmp_path: Path, run: Run) -
     assert before == {path: path.read_bytes() for path in before}
 
 
+def test_training_runs_are_one_system(good: Files, hub: HubServer, tmp_path: Path) -> None:
+    locations = []
+    for seed in range(2):
+        files = boards.changed(
+            good, tmp_path / str(seed), row=lambda row, seed=seed: row | {"training_seed": seed}
+        )
+        commit = hub.push(f"datasets/someone/seed-{seed}", files)
+        locations.append(f"someone/seed-{seed}@{commit}")
+    path = boards.write_board(tmp_path / "results.yaml", boards.submission(*locations))
+    made = make_leaderboard(read_entries(path)).to_dict()
+    [system] = made["boards"][0]["systems"]
+    assert made["refused"] == [] and system["rank"] == 1
+    assert system["success"]["k7"]["training_runs"] == len(system["runs"]) == 2
+
+
 def test_videos_are_linked(good: Files, hub: HubServer, tmp_path: Path) -> None:
     def filmed(row: dict[str, Any]) -> dict[str, Any]:
         return row | {"video": "videos/a.mp4"} if row["condition"] == "k7" else row
