@@ -1,15 +1,12 @@
 """The checks of the twelve rules: each yields what does not hold, a sentence each."""
 
 import csv
-import hashlib
 import re
 from collections import Counter
 from collections.abc import Iterator
 
-import pyarrow.parquet as pq
-
 from robomme_interference_data.constants import PROTOCOL_VERSION, QUESTIONS, RUN_TABLES
-from robomme_interference_data.errors import InterferenceError, counted
+from robomme_interference_data.errors import InterferenceError, counted, first_line
 from robomme_interference_data.evaluate.probe.noise import LEAK_P
 from robomme_interference_data.evaluate.probe.result import BROKEN, probe_text
 from robomme_interference_data.evaluate.run.row import Rollout
@@ -19,6 +16,9 @@ from robomme_interference_data.evaluate.systems import SYSTEMS
 from robomme_interference_data.schema.codec import arrow_schema, to_table
 from robomme_interference_data.schema.rollouts import KEY_COLUMNS, Status
 from robomme_interference_data.schema.shifts import NO_SHIFT
+from robomme_interference_data.storage.files import sha256_file
+from robomme_interference_data.storage.parquet import open_parquet, read_table
+from robomme_interference_data.storage.text import read_text
 
 from .entries import MemoryKind
 from .published import CARD, RATES, Case, Results
@@ -205,28 +205,27 @@ def unchanged(case: Case) -> Iterator[str]:
 
 def _changes(results: Results) -> Iterator[str]:
     path = results.folder / RUN_TABLES[0]
-    data = path.read_bytes()
-    stated = re.search(
-        rf"SHA-256 of `{re.escape(path.name)}`.*?\b([0-9a-f]{{64}})\b",
-        (results.folder / CARD).read_text(encoding="utf-8", errors="replace"),
-    )
+    try:
+        card = read_text(results.folder / CARD)
+        rates = read_text(results.folder / RATES)
+        with open_parquet(path) as opened:
+            table = read_table(opened, path).to_pylist()
+    except InterferenceError as error:
+        yield first_line(error)
+        return
+    stated = re.search(rf"SHA-256 of `{re.escape(path.name)}`.*?\b([0-9a-f]{{64}})\b", card)
     if stated is None:
         yield f"{CARD} does not state the SHA-256 of {path.name}"
-    elif stated[1] != hashlib.sha256(data).hexdigest():
+    elif stated[1] != sha256_file(path):
         yield f"the SHA-256 of {path.name} is not the one that {CARD} states"
-    try:
-        recorded = to_table(results.rows, arrow_schema(Rollout)).to_pylist()
-        table = pq.read_table(path).to_pylist()
-    except (OSError, ValueError) as error:
-        yield f"{path.name} cannot be read: {str(error).partition(chr(10))[0]}"
-        return
+    recorded = to_table(results.rows, arrow_schema(Rollout)).to_pylist()
     if sorted(map(repr, recorded)) != sorted(map(repr, table)):
         yield f"{path.name} does not hold the rows of the record"
-    yield from _other_rates(results)
+    yield from _other_rates(results, rates)
 
 
-def _other_rates(results: Results) -> Iterator[str]:
-    """Yield rates that the repository states and its rows do not give."""
+def _other_rates(results: Results, stated: str) -> Iterator[str]:
+    """Yield rates that the repository states, as CSV, and its rows do not give."""
     settings = Settings(rows=(results.folder,), expected=Expected.OBSERVED)
     try:
         scored = score(settings, _DRAWS)
@@ -235,11 +234,8 @@ def _other_rates(results: Results) -> Iterator[str]:
         return
     names = ("simulator", "system", "condition", "n", "successes", "rate")
     ours, theirs = (
-        {tuple(row[name] for name in names) for row in csv.DictReader(text.splitlines())}
-        for text in (
-            scored.tables["main"].csv(),
-            (results.folder / RATES).read_text(encoding="utf-8", errors="replace"),
-        )
+        {tuple(map(row.get, names)) for row in csv.DictReader(text.splitlines())}
+        for text in (scored.tables["main"].csv(), stated)
     )
     for cell in sorted(cell for cell in ours - theirs if cell[3] != "0")[:_SHOWN]:
         _, system, condition, n, _, rate = cell

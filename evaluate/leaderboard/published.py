@@ -9,7 +9,12 @@ from pathlib import Path
 from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD, RUN_TABLES
 from robomme_interference_data.data.buffer_set import BufferSet
 from robomme_interference_data.data.loading import load_buffer_set
-from robomme_interference_data.errors import FormatError, InterferenceError, MissingFileError
+from robomme_interference_data.errors import (
+    FormatError,
+    InterferenceError,
+    MissingFileError,
+    first_line,
+)
 from robomme_interference_data.evaluate.run.record import RunHeader, rows_that_count, whole_lines
 from robomme_interference_data.evaluate.run.row import Rollout, row_of
 from robomme_interference_data.ids import EpisodeId
@@ -98,7 +103,7 @@ class Results:
         try:
             self._open(location)
         except (InterferenceError, OSError) as error:
-            self.fault = str(error).partition("\n")[0]
+            self.fault = first_line(error)
 
     def _open(self, location: str) -> None:
         files = locate(location)
@@ -138,7 +143,7 @@ def _rows(path: Path) -> list[Rollout]:
         try:
             rows.append(row_of(line))
         except ValueError as error:
-            reason = str(error).partition("\n")[0]
+            reason = first_line(error)
             raise FormatError(f"{path.name}, line {number} is no row: {reason}") from None
     kept = rows_that_count([row.key for row in rows], [row.status for row in rows])
     return [rows[place] for place in kept]

@@ -168,6 +168,17 @@ def test_what_the_hub_does_not_have(
     assert part in problems[0].what
 
 
+@pytest.mark.parametrize("name", ["rollouts.parquet", RATES, "README.md"])
+@pytest.mark.parametrize("data", [b"", b"nothing of it", b"\xff\x00,"])
+def test_damaged_files_of_a_repository(
+    name: str, data: bytes, good: Files, hub: HubServer, tmp_path: Path
+) -> None:
+    commit = hub.push(f"datasets/{REPOSITORY}", good | {name: data})
+    entry = boards.submission(f"{REPOSITORY}@{commit}")
+    problems = check_all(read_entries(boards.write_board(tmp_path / "results.yaml", entry)))
+    assert {problem.rule.number for problem in problems} == {11}
+
+
 def test_names_are_unique_on_a_board(
     good: Files, made: Path, hub: HubServer, tmp_path: Path
 ) -> None:
