@@ -50,17 +50,16 @@ def _shared(name: str) -> str:
 def _groups(board: Mapping[str, Any]) -> dict[str, Any]:
     """Return the systems and families that parts of a board show."""
     ran = [system for system in board["systems"] if board["ranked_by"] in system["success"]]
-    names = {system["system"]: system["name"] for system in board["systems"]}
+    systems = {system["system"]: system for system in board["systems"]}
     families = dict.fromkeys(name for system in ran for name in system["families"])
     return {
         "ran": ran,
         "lines": {
-            system["system"]: system["success"][board["controls"][system["system"]]]["rate"]
-            for system in board["systems"]
-            if system["system"] in board["controls"]
+            control: systems[control]["success"][condition]["rate"]
+            for control, condition in board["controls"].items()
         },
-        "names": names,
-        "control_names": [names[control] for control in board["controls"]],
+        "names": {name: system["name"] for name, system in systems.items()},
+        "control_names": [systems[control]["name"] for control in board["controls"]],
         "compared": [system for system in ran if system["differences"]],
         "families": [*families],
         "others": [name for name in board["conditions"] if name != board["ranked_by"]],

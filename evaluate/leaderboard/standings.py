@@ -18,7 +18,7 @@ from robomme_interference_data.evaluate.score.partners import ceilings_of, share
 from robomme_interference_data.evaluate.score.scoring import Score, score
 from robomme_interference_data.evaluate.score.tables.cells import SuccessCell
 from robomme_interference_data.evaluate.score.tables.contrast import LESSON_ONLY
-from robomme_interference_data.evaluate.score.tables.pairs import compare_cells
+from robomme_interference_data.evaluate.score.tables.pairs import NO_PAIRS, Pairs, compare_cells
 from robomme_interference_data.evaluate.score.tables.ranks import all_pairs, rankings
 from robomme_interference_data.evaluate.systems import display_name
 from robomme_interference_data.schema.conditions import NO_HISTORY, in_order
@@ -179,13 +179,7 @@ class Standings:
     def _differences(self) -> dict[str, dict[str, Any]]:
         """Return each system's difference to each control, on the same episodes."""
         compared = {
-            (system, control): compare_cells(
-                self.outcomes.status[self.outcomes.cell(control, condition)],
-                self.outcomes.status[self.outcomes.cell(system, self.last)],
-                self.outcomes.training,
-                same_weights=share_weights(self.outcomes, system, control),
-                paired=self.outcomes.pairable(system, control),
-            )
+            (system, control): self._compare((control, condition), (system, self.last))
             for system in self.shown
             if self._ran_last(system) and system not in self.controls
             for control, condition in self.controls.items()
@@ -197,6 +191,20 @@ class Standings:
                 values = {"n": pairs.n, "p_holm": known(p), "paired": pairs.paired}
                 found.setdefault(system, {})[control] = interval_values(pairs.change) | values
         return found
+
+    def _compare(self, first: tuple[str, str], second: tuple[str, str]) -> Pairs:
+        """Compare two cells over the episodes that count in both, also where they are unpaired."""
+        places = [self.outcomes.cell(*cell) for cell in (first, second)]
+        shared = np.logical_and(*(self.outcomes.counted[place] for place in places))
+        if not shared.any():
+            return NO_PAIRS
+        statuses = [self.outcomes.status[place][shared] for place in places]
+        return compare_cells(
+            *statuses,
+            self.outcomes.training,
+            same_weights=share_weights(self.outcomes, first[0], second[0]),
+            paired=self.outcomes.pairable(first[0], second[0]),
+        )
 
     def _ran_last(self, system: str) -> bool:
         return (system, self.last, "") in self._cells

@@ -1,6 +1,7 @@
 """Leaderboards: twelve rules, each broken once, and what accepted submissions become."""
 
 import json
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -13,10 +14,11 @@ from support.boards import BOARD, SYSTEM, Files
 from support.browser import open_page
 from support.hub_server import HubServer
 from support.messages import raises
-from support.scoring import RELEASED, ROOT
+from support.scoring import BASE, OWN, RELEASED, RETRIEVAL, ROOT
 
 from robomme_interference_data.errors import FormatError, InvalidOptionError
 from robomme_interference_data.evaluate.leaderboard.entries import (
+    BoardStanding,
     PublishedRun,
     Submission,
     add_submission,
@@ -26,6 +28,7 @@ from robomme_interference_data.evaluate.leaderboard.plain_values import letter
 from robomme_interference_data.evaluate.leaderboard.published import RATES, Results, ranked_by
 from robomme_interference_data.evaluate.leaderboard.rules import RULES
 from robomme_interference_data.evaluate.leaderboard.site import (
+    Leaderboard,
     check_all,
     make_leaderboard,
     write_site,
@@ -365,6 +368,24 @@ def test_the_written_json(tmp_path: Path) -> None:
     assert (difference["n"], difference["value"]) == (12, 0.5)
 
 
+def test_differences_stand_below_their_control(tmp_path: Path) -> None:
+    [board] = boards.made_up(tmp_path).boards
+    shown = {**board.shown, OWN: replace(board.shown[OWN], standing=BoardStanding.CONTROL)}
+    board.shown = {name: shown[name] for name in (OWN, "guess", RETRIEVAL, BASE)}
+    data = write_site(Leaderboard((board,), ()), tmp_path / "site")
+    page = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
+    table = page[page.index("Differences to the controls") :]
+    table = table[: table.index("</table>")]
+    heads = re.findall(r'<button type="button">([^<]*)</button>', table)
+    rows = [re.findall(r'data-value="([^"]*)"', row) for row in table.split("<tr>")[2:]]
+    names = {system["name"]: system for system in data["boards"][0]["systems"]}
+    assert len(heads) == 3 and len(rows) == 2
+    for row, name in zip(rows, re.findall(r'<th scope="row">([^<]*)</th>', table), strict=True):
+        for value, head in zip(row, heads[1:], strict=True):
+            expected = names[name]["differences"][names[head]["system"]]["value"]
+            assert float(value) == expected
+
+
 @pytest.mark.slow
 def test_the_leaderboard_of_this_repository(tmp_path: Path, run: Run) -> None:
     """Its rows break rules 2 and 6, so all are references."""
@@ -438,6 +459,9 @@ def test_the_page_in_a_browser(tmp_path: Path) -> None:
             "e.value = 'no-history'; e.dispatchEvent(new Event('input')); }"
         )
         assert page.run(rows) == 3
+        # Each column of differences is that of its control.
+        heads = "[...document.querySelectorAll('h3 + section thead th')].map(e => e.textContent)"
+        assert page.run(heads)[:2] == ["system", "Guess"]
 
 
 # --- the command that adds a submission ----------------------------------------------------------
