@@ -194,16 +194,17 @@ class Standings:
 
     def _compare(self, first: tuple[str, str], second: tuple[str, str]) -> Pairs:
         """Compare two cells over the episodes that count in both, also where they are unpaired."""
-        places = [self.outcomes.cell(*cell) for cell in (first, second)]
-        shared = np.logical_and(*(self.outcomes.counted[place] for place in places))
+        outcomes = self.outcomes
+        one, other = outcomes.cell(*first), outcomes.cell(*second)
+        shared = outcomes.counted[one] & outcomes.counted[other]
         if not shared.any():
             return NO_PAIRS
-        statuses = [self.outcomes.status[place][shared] for place in places]
         return compare_cells(
-            *statuses,
-            self.outcomes.training,
-            same_weights=share_weights(self.outcomes, first[0], second[0]),
-            paired=self.outcomes.pairable(first[0], second[0]),
+            outcomes.status[one][shared],
+            outcomes.status[other][shared],
+            outcomes.training,
+            same_weights=share_weights(outcomes, first[0], second[0]),
+            paired=outcomes.pairable(first[0], second[0]),
         )
 
     def _ran_last(self, system: str) -> bool:
