@@ -23,6 +23,7 @@ from robomme_interference_data.errors import (
     naming_options,
 )
 from robomme_interference_data.evaluate import commands as evaluating
+from robomme_interference_data.evaluate.leaderboard import commands as boards
 from robomme_interference_data.evaluate.score import commands as scoring
 from robomme_interference_data.evaluate.vla_eval import commands as vla_eval
 from robomme_interference_data.retrieval import commands as retrieving
@@ -141,6 +142,8 @@ _GROUPS: dict[str, tuple[tuple[str, Callable[..., None]], ...]] = {
         ("card", publishing.card),
         ("publish", publishing.publish),
         ("publish-results", publishing.publish_results),
+        ("submit", boards.submit),
+        ("leaderboard", boards.leaderboard),
     ),
 }
 """Commands by title, in their order of use."""

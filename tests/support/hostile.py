@@ -36,6 +36,7 @@ from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.embeddings import EmbeddingIndex
 from robomme_interference_data.data.questions import digest_questions, read_questions
 from robomme_interference_data.errors import InterferenceError
+from robomme_interference_data.evaluate.leaderboard.entries import read_entries
 from robomme_interference_data.evaluate.run.log import read_run
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
 from robomme_interference_data.schema.reference_plan import ReferencePlan
@@ -62,6 +63,8 @@ _RESULTS = {
     "tasks": [{"task": "pick up the bowl", "episodes": [_EPISODE]}],
 }
 """Results of vla-eval with another benchmark."""
+
+_LEADERBOARD = GOLDEN.parents[2] / "docs" / "leaderboard" / "results.yaml"
 
 _MAX_LISTED = 64  # of what a file lists, so many are looked at: there may be any number
 
@@ -102,6 +105,7 @@ def places(root: Path) -> Path:
     (root / "single/a.png").write_bytes(image)
     shutil.copy(GOLDEN / "demonstrations/meta/SHA256SUMS", root / "single")
     (root / "single/scene.json").write_text(_SCENES["VideoUnmaskSwap"])
+    shutil.copyfile(_LEADERBOARD, root / "single/results.yaml")
     eval_info.write(root / "single/eval_info.json", {("pusht", 0): "sf", ("pusht", 1): "fs"})
     (root / "single/results.json").write_text(json.dumps(_RESULTS))
     write_plan(_golden_plan(), root / "single/plan.json")
@@ -266,6 +270,9 @@ TARGETS = {
     "record": Target(f"run/{RUN_RECORD}", _record),
     "lerobot-eval": Target("single/eval_info.json", _outcomes("eval_info.json")),
     "vla-eval": Target("single/results.json", _outcomes("results.json")),
+    "leaderboard": Target(
+        "single/results.yaml", lambda root: read_entries(root / "single/results.yaml")
+    ),
 }
 """All readers of untrusted files, by name."""
 

@@ -4,6 +4,7 @@ import shutil
 import sys
 from pathlib import Path
 
+from support.boards import make_golden_leaderboard
 from support.buffer_sets import build, plan_again
 from support.cards import cards, without_version
 from support.tabletop import make_tabletop
@@ -34,6 +35,7 @@ if __name__ == "__main__":
         ("buffer_set", make_sample),
         ("tabletop", make_tabletop),
         ("cards", make_cards),
+        ("leaderboard", make_golden_leaderboard),
     ):
         golden = Path(sys.argv[1]) / name
         shutil.rmtree(golden, ignore_errors=True)  # a build would resume

@@ -5,6 +5,7 @@ A page's folder is prepared with the data that the page starts from. Nothing is 
 """
 
 import os
+import re
 import shlex
 import shutil
 import sys
@@ -131,6 +132,15 @@ def scored(folder: Path) -> None:
     (folder / "canonical_rollouts.csv").write_text("\n".join(named) + "\n")
 
 
+def boards(folder: Path) -> None:
+    """A buffer set where the demo has one, and the page's file of a leaderboard on it."""
+    copy_buffer_set(folder / "demo" / "buffers")
+    text = (HOW_TO / "leaderboard.md").read_text(encoding="utf-8")
+    [file] = re.findall(r"^```yaml\n(.*?)^```", text, flags=re.S | re.M)
+    played = file.replace("simulator: tabletop", "simulator: support.worlds:World")
+    (folder / "demo" / "results.yaml").write_text(played, encoding="utf-8")
+
+
 def nothing(folder: Path) -> None:
     """The page makes what it needs."""
 
@@ -176,6 +186,7 @@ PREPARED: dict[str, Callable[[Path], None]] = {
     "another-benchmark.md": nothing,
     "compare-systems.md": scored,
     "days.md": nothing,
+    "leaderboard.md": boards,
     "publish.md": recorded,
     "real-robots.md": robots,
     "retrieval.md": nothing,
@@ -237,7 +248,7 @@ def test_a_page_runs_from_top_to_bottom(
     folder.mkdir()
     monkeypatch.chdir(folder)
     PREPARED.get(page, golden)(folder)
-    built = "my-days" if page == "days.md" else "my-buffers"
+    built = {"days.md": "my-days", "leaderboard.md": "demo/buffers"}.get(page, "my-buffers")
     monkeypatch.setenv(worlds.BUFFER_SET, str(folder / built))
     push_buffer_set(hub, GOLDEN, tmp_path / "work", "namespace/name")
     names: dict[str, Any] = {}
