@@ -27,11 +27,11 @@ declare -A memories=(
 for name in "${!memories[@]}"; do
     robomme-interference ceiling test-days --memory "${memories[$name]}" --json > "ceiling-$name.json"
     robomme-interference ask test-days --model recall --memory "${memories[$name]}" \
-        --system "recall-$name" --out "asked/recall-$name"
+        --system "observer-$name" --out "asked/observer-$name"
     for rule in max window windows3 changes; do
         robomme-interference ask test-days --model recall --memory "${memories[$name]}" \
             --retrieval thumbnail --retrieval-rule $rule --conditions day-k7 \
-            --system "recall-$name-$rule" --out "asked/recall-$name-$rule"
+            --system "observer-$name-$rule" --out "asked/observer-$name-$rule"
     done
 done
 for model in guess abstain; do
