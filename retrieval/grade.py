@@ -1,7 +1,7 @@
 """Grade choices against the true sessions, without a simulator and without IO.
 
-A cell is a family, or an ability, under one condition; it passes if mean purity and mean coverage are both at
-least `PASS_MARK` (released reference).
+A cell is a family, or an ability, under one condition. It passes if mean purity and mean coverage
+are both at least `PASS_MARK` (released reference).
 """
 
 import math
