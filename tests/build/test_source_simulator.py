@@ -111,7 +111,7 @@ def test_the_tabletop_under_shifts(made: list[Double]) -> None:
     recording = read(source, ("front",))
     frames = list(recording.frames)
     assert (recording.goals, recording.seed) == (("goal", "other"), 9)
-    assert [int(frame.images["front"][0, 0, 0]) for frame in frames] == list(range(10, 19))
+    assert [int(frame.images["front"][0, 0, 0]) for frame in frames] == list(range(10, 22))
     assert {(frame.is_demonstration, frame.action, *frame.state) for frame in frames} == {
         (False, None, *[10.0] * 8)
     }

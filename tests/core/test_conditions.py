@@ -155,7 +155,7 @@ def test_shifts_are_written_as_they_are_read() -> None:
     assert parse_shift("none") is None
     assert list(map(str, SHIFTS)) == [
         *("light:1", "light:2", "light:3", "camera:1", "camera:2", "camera:3"),
-        *("clutter:1", "clutter:2", "clutter:3"),
+        *("clutter:1", "clutter:2", "clutter:3", "colors:1", "colors:2", "colors:3"),
     ]
     assert tuple(parse_shift(str(shift)) for shift in SHIFTS) == SHIFTS
 

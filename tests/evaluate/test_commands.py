@@ -52,7 +52,7 @@ def test_ceiling_prints_a_table_or_json(tiny_buffers: Path) -> None:
     assert ["MoveCube", "k0", "1", "50.0%"] in lines and ["all", "k1", "3", "0.0%"] in lines
     cells = json.loads(type_in(f"{line} --json").stdout)
     assert cells[0] == {
-        "family": "VideoRepick",
+        "part": "VideoRepick",
         "condition": "k0",
         "queries": 1,
         "evidence_kept": 0.5,
