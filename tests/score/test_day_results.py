@@ -1,0 +1,130 @@
+"""What docs/results/day.md states is what its rows say, of the versions that the code has."""
+
+import csv
+from collections import Counter
+
+import pyarrow.parquet as pq
+import pytest
+from support import scoring as made
+from support.pages import RESULTS, table
+
+from robomme_interference_data.constants import ABILITIES, PROTOCOL_VERSION
+from robomme_interference_data.stats.significance import holm
+
+PAGE = (RESULTS / "day.md").read_text(encoding="utf-8")
+FOLDER = RESULTS / "day"
+MEMORIES = ("full", "framesamp-128", "framesamp-32", "window-60s")
+LAST = "day-k7"
+
+
+def read(name: str) -> list[dict[str, str]]:
+    with (FOLDER / name).open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def ceilings(part: str, condition: str) -> dict[str, dict[str, str]]:
+    return {
+        row["memory"]: row
+        for row in read("ceilings.csv")
+        if (row["part"], row["condition"]) == (part, condition)
+    }
+
+
+def percent(value: str) -> str:
+    return f"{100 * float(value):.1f}%"
+
+
+def test_ceilings_by_ability() -> None:
+    listed = table(PAGE, "ability | queries")
+    assert [row["ability"].strip("`") for row in listed] == [*ABILITIES, "all"]
+    for row in listed:
+        part = row["ability"].strip("`")
+        found, without = ceilings(part, LAST), ceilings(part, "no-history")
+        assert row["queries"] == found["full"]["queries"]
+        assert {percent(cell["success"]) for cell in without.values()} == {row["no history"]}
+        for memory in MEMORIES:
+            assert row[f"`{memory}`"] == percent(found[memory]["success"])
+
+
+def test_ceilings_by_distance() -> None:
+    listed = table(PAGE, "condition | `full`")
+    assert len(listed) == 6
+    for row in listed:
+        found = ceilings("all", row["condition"].strip("`"))
+        for memory in MEMORIES:
+            assert row[f"`{memory}`"] == percent(found[memory]["success"])
+
+
+@pytest.fixture(scope="module")
+def successes() -> Counter[tuple[str, str]]:
+    rows = pq.read_table(FOLDER / "asked.parquet").to_pylist()
+    assert {row["protocol_version"] for row in rows} == {PROTOCOL_VERSION}
+    return Counter((row["system"], row["condition"]) for row in rows if row["success"])
+
+
+def test_the_observer_reaches_its_ceiling(successes: Counter[tuple[str, str]]) -> None:
+    """Asked with a few options, it is right as often as among all answers, or more often."""
+    for memory in MEMORIES:
+        for condition in ("no-history", "day-alone", "day-k0", LAST, "day-cut-k7"):
+            expected = float(ceilings("all", condition)[memory]["success"])
+            count = successes[f"observer-{memory}", condition]
+            assert count / 149 > expected - 0.02
+            if memory == "full" and condition != "no-history":
+                assert count == 149
+
+
+def test_retrieval(successes: Counter[tuple[str, str]]) -> None:
+    graded = {
+        (row["rule"].partition("/")[0], row["part"], row["condition"]): row
+        for row in read("retrieval.csv")
+    }
+    for row in table(PAGE, "rule | hit"):
+        rule = row["rule"].strip("`")
+        found, cut = (graded[rule, "all", name] for name in (LAST, "day-cut-k7"))
+        for head, column in (
+            ("hit", "hit"),
+            ("purity", "purity"),
+            ("coverage", "coverage"),
+            ("evidence kept", "evidence_kept"),
+        ):
+            assert row[head] == f"{100 * float(found[column]):.0f}%"
+        assert row["kept under `day-cut-k7`"] == f"{100 * float(cut['evidence_kept']):.0f}%"
+        for memory in ("full", "framesamp-32"):
+            if rule != "oracle":
+                count = successes[f"observer-{memory}-{rule}", LAST]
+                assert row[f"`observer-{memory}`"] == f"{count} of 149"
+    for row in table(PAGE, "evidence kept of"):
+        ability = row["evidence kept of"].strip("`")
+        for rule in ("max", "window", "windows3", "changes", "oracle"):
+            kept = graded[rule, ability, LAST]["evidence_kept"]
+            assert row[f"`{rule}`"] == f"{100 * float(kept):.0f}%"
+
+
+def test_rollouts() -> None:
+    score = made.score(FOLDER / "acted.parquet")
+    cells = {(cell.system, cell.condition, cell.part): cell for cell in score.cells if cell.n}
+    listed = table(PAGE, "history | MoveCube")
+    assert len(listed) == 4
+    for row in listed:
+        condition, _, retrieval = row.pop("history").partition(", ")
+        system = "retrieval-replay-framesamp-changes" if retrieval else "replay-framesamp"
+        for part, text in row.items():
+            cell = cells[system, condition.strip("`"), "" if part == "all" else part]
+            assert text == f"{cell.counts[0]} of {cell.n}"
+
+
+def test_shortcuts() -> None:
+    rows = [row for row in read("shortcuts.csv") if row["condition"] == LAST]
+    for row in table(PAGE, "guessed | queries"):
+        target = row["guessed"]
+        found = {
+            line["cue"]: line
+            for line in rows
+            if (line["target"], line["ability"]) == (target, "all")
+        }
+        assert {line["queries"] for line in found.values()} == {row["queries"]}
+        for cue, line in found.items():
+            assert row[cue] == f"{line['right']} ({float(line['expected']):.1f})"
+    answers = [row for row in rows if row["target"] == "answer" and row["ability"] != "all"]
+    least = min(holm([float(row["p"]) for row in answers]))
+    assert f"{len(answers)} tests of the answers is {least:.2f}" in PAGE
