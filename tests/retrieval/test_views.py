@@ -32,13 +32,13 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 def test_views_are_frames_in_the_order_of_shifts(seen: Path) -> None:
     views, buffer_set = dataset(seen, SHIFTED), load_buffer_set(seen)
-    assert (views.kind, len(views), views.identity.counts.frames) == ("shifted", 3, 27)
+    assert (views.kind, len(views), views.identity.counts.frames) == ("shifted", 3, 36)
     assert views.identity.unit is None
     for episode in QUERIES:
         index, query = views.index_of(EpisodeId.parse(episode)), buffer_set.query(episode)
         record = views.record(index)
-        assert (record.length, record.exec_start_idx, record.seed) == (9, None, query.seed)
-        for place, image in enumerate(views.iter_frames(index, "front", 0, 9)):
+        assert (record.length, record.exec_start_idx, record.seed) == (12, None, query.seed)
+        for place, image in enumerate(views.iter_frames(index, "front", 0, 12)):
             assert np.array_equal(image, query.frame() >> place)
     assert buffer_set.revision != load_buffer_set(GOLDEN).revision
     assert list(verify_buffer_set(buffer_set)) == []
