@@ -100,6 +100,41 @@ def test_retrieval(successes: Counter[tuple[str, str]]) -> None:
             assert row[f"`{rule}`"] == f"{100 * float(kept):.0f}%"
 
 
+def test_controls(successes: Counter[tuple[str, str]]) -> None:
+    for system in ("questions-abstain", "questions-guess"):
+        assert successes[system, LAST] == 26
+    assert successes["observer-window-60s", LAST] == 26
+    assert successes["observer-window-60s-windows3", LAST] == 126
+    assert successes["observer-framesamp-32", LAST] == 117
+    assert successes["observer-framesamp-32", "day-cut-k7"] == 114
+
+
+@pytest.mark.parametrize(
+    ("file", "one", "other", "gained", "lost"),
+    [
+        ("asked", ("observer-framesamp-32", "day-cut-k7"), ("observer-framesamp-32", LAST), 8, 5),
+        ("acted", ("replay-framesamp", "day-alone"), ("replay-framesamp", LAST), 0, 29),
+        ("acted", ("replay-framesamp", LAST), ("retrieval-replay-framesamp-changes", LAST), 7, 2),
+    ],
+)
+def test_paired_changes(
+    file: str, one: tuple[str, str], other: tuple[str, str], gained: int, lost: int
+) -> None:
+    rows = pq.read_table(FOLDER / f"{file}.parquet").to_pylist()
+    before, after = (
+        {
+            (row["family"], row["episode"]): row["success"]
+            for row in rows
+            if (row["system"], row["condition"]) == key
+        }
+        for key in (one, other)
+    )
+    assert before.keys() == after.keys()
+    changes = Counter((before[query], after[query]) for query in before)
+    assert (changes[False, True], changes[True, False]) == (gained, lost)
+    assert f"{gained} gained, {lost} lost" in PAGE
+
+
 def test_rollouts() -> None:
     score = made.score(FOLDER / "acted.parquet")
     cells = {(cell.system, cell.condition, cell.part): cell for cell in score.cells if cell.n}
