@@ -197,9 +197,9 @@ def _measure(
 ) -> Iterator[DayShortcut]:
     """Yield what each cue reveals of values, which are guessed within groups."""
     days_of: dict[Hashable, set[EpisodeId]] = {}
-    for asked, one in zip(queries, groups, strict=True):
-        days_of.setdefault(one, set()).add(asked.day)
-    compared = [at for at, one in enumerate(groups) if len(days_of[one]) > 1]
+    for asked, group_of in zip(queries, groups, strict=True):
+        days_of.setdefault(group_of, set()).add(asked.day)
+    compared = [at for at, group_of in enumerate(groups) if len(days_of[group_of]) > 1]
     if not compared:
         return
     queries = [queries[at] for at in compared]
@@ -284,8 +284,10 @@ def day_shortcut_table(measured: Sequence[DayShortcut], title: str) -> Table:
     columns |= {cue: "count" for cue in CUES}
     columns["p"] = "p"
     rows: dict[tuple[str, str, str], dict[str, DayShortcut]] = {}
-    for one in measured:
-        rows.setdefault((one.condition, one.target, one.ability), {})[one.cue] = one
+    for shortcut in measured:
+        names = shortcut.condition, shortcut.target, shortcut.ability
+        rows.setdefault(names, {})[shortcut.cue] = shortcut
+    adjusted = _adjusted(measured)
     return Table(
         "day-shortcuts",
         title,
@@ -294,9 +296,9 @@ def day_shortcut_table(measured: Sequence[DayShortcut], title: str) -> Table:
             (
                 *names,
                 cues["length"].queries,
-                float(np.mean([one.expected for one in cues.values()])),
+                float(np.mean([shortcut.expected for shortcut in cues.values()])),
                 *(cues[cue].right if cue in cues else None for cue in CUES),
-                min(holm([one.p for one in cues.values()])),
+                min(adjusted[shortcut] for shortcut in cues.values()),
             )
             for names, cues in rows.items()
         ],
@@ -304,7 +306,20 @@ def day_shortcut_table(measured: Sequence[DayShortcut], title: str) -> Table:
         "query nearest in length of the history, frames since the day began, task after which it "
         "can be asked, frames after that task, or first live observation, among those of other "
         "days and the same family and difficulty (abilities: families with the same abilities). By "
-        "chance: the "
-        "mean over permutations of the answers; p: the smallest of the cues' one-sided p-values, "
-        "adjusted by Holm's method.",
+        "chance: the mean over permutations of the answers; p: the smallest of the cues' one-sided "
+        "p-values, after Holm's correction for all cues and abilities of a condition; in the row "
+        "of all abilities, for the cues.",
     )
+
+
+def _adjusted(measured: Sequence[DayShortcut]) -> dict[DayShortcut, float]:
+    """Return the p-values after Holm's correction: for all abilities together, and for `ALL`."""
+    families: dict[tuple[str, str, bool], list[DayShortcut]] = {}
+    for shortcut in measured:
+        family = shortcut.condition, shortcut.target, shortcut.ability == ALL
+        families.setdefault(family, []).append(shortcut)
+    adjusted: dict[DayShortcut, float] = {}
+    for tests in families.values():
+        values = holm([shortcut.p for shortcut in tests])
+        adjusted |= dict(zip(tests, values, strict=True))
+    return adjusted

@@ -71,7 +71,7 @@ def disagreements(root: Path, version: str) -> Iterator[str]:
     newest, _ = newest_section(root)
     if newest.split()[0] != version:
         yield f"CHANGELOG.md begins with {newest}, not {version}: rename its first section"
-    changed = git(root, "status", "--porcelain").splitlines()
+    changed = git(root, "status", "--porcelain", check=True).splitlines()
     if changed:
         listed = ", ".join(line[3:] for line in changed[:5])
         yield f"{len(changed)} files are not committed ({listed}): commit or remove them"
@@ -89,10 +89,16 @@ def newest_section(root: Path) -> tuple[str, str]:
     return heading, text.strip() + "\n"
 
 
-def git(root: Path, *arguments: str) -> str:
-    """Return what git prints; nothing, if it has no answer."""
+def git(root: Path, *arguments: str, check: bool = False) -> str:
+    """Return what git prints; nothing, if it has no answer.
+
+    With `check`, the release ends where git fails, which must not read as an answer.
+    """
     command = ["git", "-C", str(root), *arguments]
-    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.rstrip("\n")
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if check and done.returncode:
+        sys.exit(f"release: {shlex.join(command)} fails: {done.stderr.strip()}")
+    return done.stdout.rstrip("\n")
 
 
 def name_problems(index: str, project: dict[str, Any], version: str) -> Iterator[str]:
@@ -124,7 +130,9 @@ def published_urls(index: str, name: str) -> set[str]:
         subprocess.run(command, capture_output=True, check=False)
         for wheel in Path(folder).glob("*.whl"):
             with zipfile.ZipFile(wheel) as archive:
-                [path] = [one for one in archive.namelist() if one.endswith(".dist-info/METADATA")]
+                [path] = [
+                    name for name in archive.namelist() if name.endswith(".dist-info/METADATA")
+                ]
                 lines = archive.read(path).decode().splitlines()
             return {line.split(", ")[-1] for line in lines if line.startswith("Project-URL: ")}
     return set()

@@ -30,16 +30,16 @@ def letter(counts: Sequence[int]) -> str:
 def stated(case: Case | None) -> dict[str, Any]:
     """Return what a submission states, and where its results are."""
     if case is None:
-        return {"remembers": None, "parameters": None, "probe": None, "runs": []}
+        return {"remembers": None, "parameters": None, "runs": []}
     return {
         "remembers": case.submission.memory,
         "parameters": case.submission.parameters,
-        "probe": next((each.header.probed for each in case.results), None),
         "runs": [
             {
                 "results": each.run.results,
                 "checkpoint": each.run.checkpoint,
                 "checkpoint_sha256": each.run.checkpoint_sha256,
+                "probe": each.header.probed,
                 "links": dict(each.links),
             }
             for each in case.results

@@ -90,6 +90,7 @@ class Results:
     Attributes:
         run: Its entry.
         fault: Why its files cannot be read; empty if they can.
+        on_hub: Whether it is a repository on the Hub.
         paths: Its files.
         folder: Where they are on this machine.
         header: Its `run.json`.
@@ -107,6 +108,7 @@ class Results:
 
     def _open(self, location: str) -> None:
         files = locate(location)
+        self.on_hub = isinstance(files, HubFiles)
         if isinstance(files, HubFiles):
             if not _PINNED.fullmatch(location):
                 raise MissingFileError(

@@ -88,7 +88,7 @@ RULES = (
     ),
     SubmissionRule(
         7,
-        "no state survives a reset",
+        "no leak was found",
         "Let the policy forget everything at a reset, and run it in a new folder.",
         checks.independent,
     ),

@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from robomme_interference_data.constants import FORMAT_VERSION, OFFICIAL
-from robomme_interference_data.errors import FormatError
+from robomme_interference_data.errors import FormatError, InterferenceError, first_line
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
 from robomme_interference_data.evaluate.score.rows.values import Row
 from robomme_interference_data.storage.files import write_json, write_text
@@ -18,7 +18,7 @@ from .entries import Board, BoardStanding, Entries
 from .page import write_page
 from .published import Grid, open_case
 from .rules import RULES, BrokenRule, check
-from .standings import BoardRows, BoardSystem, Standings
+from .standings import BoardRows, BoardSystem, Standings, settings_of
 
 DATA = "leaderboard.json"
 PAGE = "index.html"
@@ -135,10 +135,24 @@ def _gather(entries: Entries, board: Board, released: tuple[Path, ...] = ()) -> 
         if problems := check(case):
             gathered.problems += problems
             continue
-        gathered.rows.append(BoardRows(tuple(each.folder for each in case.results)))
+        rows = BoardRows(tuple(each.folder for each in case.results))
+        if contradiction := _contradiction([*gathered.rows, rows]):
+            gathered.problems.append(BrokenRule(system, RULES[-1], contradiction))
+            continue
+        gathered.rows.append(rows)
         shown = BoardSystem(system, BoardStanding.SUBMISSION, submission.trained_on, case)
         gathered.shown[system] = shown
     return gathered
+
+
+def _contradiction(rows: Sequence[BoardRows]) -> str:
+    """Return why the rows of a board cannot be scored together; empty if they can."""
+    settings = settings_of(rows)
+    try:
+        read_rows(settings.rows, settings.system)
+    except InterferenceError as error:
+        return first_line(error)
+    return ""
 
 
 def _add(

@@ -58,6 +58,13 @@ class BoardRows:
     system: str | None = None
 
 
+def settings_of(rows: Sequence[BoardRows]) -> Settings:
+    """Return the settings of a score of all of a board's rows."""
+    names = tuple(each.system for each in rows if each.system for _ in each.paths)
+    paths = tuple(chain.from_iterable(each.paths for each in rows))
+    return Settings(rows=paths, system=names, expected=Expected.OBSERVED)
+
+
 class Standings:
     """A board with its scored rows.
 
@@ -81,11 +88,7 @@ class Standings:
         self.board = board
         self.grid = grid
         self.shown = shown
-        names = tuple(each.system for each in rows if each.system for _ in each.paths)
-        paths = tuple(chain.from_iterable(each.paths for each in rows))
-        self.scored: Score = score(
-            Settings(rows=paths, system=names, expected=Expected.OBSERVED), _DRAWS
-        )
+        self.scored: Score = score(settings_of(rows), _DRAWS)
         self.outcomes: Outcomes = self.scored.outcomes[board.simulator]
         ran = {name for system in self.outcomes.systems for name in self.outcomes.ran(system)}
         self.conditions = tuple(each.name for each in in_order(ran))

@@ -3,7 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from robomme_interference_data.errors import FormatError
 from robomme_interference_data.stats.intervals import wilson
+
+INDEPENDENT, NONDETERMINISTIC, BROKEN = "independent", "nondeterministic", "broken"
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,9 @@ class Probe:
             differ, but a state that every rollout changes.
         error: Of a broken probe, why.
         unprobed: Of a merged run, the folders that were not probed.
+
+    Raises:
+        FormatError: There is no such verdict, or noise without a p-value.
     """
 
     verdict: str
@@ -42,6 +48,13 @@ class Probe:
     error: str | None = None
     unprobed: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        verdicts = INDEPENDENT, NONDETERMINISTIC, BROKEN
+        if self.verdict not in verdicts:
+            raise FormatError(f"verdict {self.verdict!r} is none of {', '.join(verdicts)}")
+        if self.verdict == NONDETERMINISTIC and self.p_value is None:
+            raise FormatError(f"a probe with the verdict {NONDETERMINISTIC} has no p_value")
+
     @property
     def done(self) -> bool:
         """Whether it need not be repeated."""
@@ -51,9 +64,6 @@ class Probe:
     def all_independent(self) -> bool:
         """Whether all of the run was probed, and no state survives a reset."""
         return self.verdict == INDEPENDENT and not self.unprobed
-
-
-INDEPENDENT, NONDETERMINISTIC, BROKEN = "independent", "nondeterministic", "broken"
 
 
 def probe_text(probe: Probe | None) -> str:

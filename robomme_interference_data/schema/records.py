@@ -58,7 +58,10 @@ class DaySpan:
 
     source: Annotated[EpisodeId, "The episode that is played; otherwise the day."]
     part: Annotated[str, "One of `lesson`, `first`, `second`, `idle`, `transition`."]
-    shift: Annotated[str, "How the table looks: `none`, or a shift such as `light:2`."]
+    shift: Annotated[
+        str,
+        "How the table looks, of a transition at its end: `none`, or a shift such as `light:2`.",
+    ]
     start: Annotated[int, "First frame."]
     stop: Annotated[int, "Frame after the last one."]
     sha256: Annotated[str, "Digest over the span."]

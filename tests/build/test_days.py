@@ -207,9 +207,9 @@ def test_abilities_have_ceilings(root: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 def test_what_a_policy_sees_of_a_query_without_a_memory(root: Path, run: Any) -> None:
     found = {
-        one.condition: one
-        for one in day_cues(load_buffer_set(root))
-        if (one.family, one.ability) == ("VideoUnmask", "update")
+        cues.condition: cues
+        for cues in day_cues(load_buffer_set(root))
+        if (cues.family, cues.ability) == ("VideoUnmask", "update")
     }
     whole, cut, short = (found[name] for name in ("day-k2", "day-cut-k2", "day-k0"))
     assert whole.task == 2 and short.delay == 0

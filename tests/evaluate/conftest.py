@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from support import worlds
+from support import boards, worlds
 from support.policy_server import PolicyServer
 
 
@@ -39,3 +39,21 @@ def fast_retries(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(openai._base_client, "INITIAL_RETRY_DELAY", 0.001)
     monkeypatch.setattr(endpoint, "_PAUSE_S", 0.001)
+
+
+@pytest.fixture(scope="session")
+def board_runs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Runs of three policies: one to submit, one with another memory, and a control."""
+    folder = tmp_path_factory.mktemp("runs")
+    with pytest.MonkeyPatch.context() as patch:
+        boards.use_tiny(patch)
+        boards.make_run(folder / "mine", "replay:framesamp", boards.SYSTEM)
+        boards.make_run(folder / "other", "replay:full", "other-memory")
+        boards.make_run(folder / "window", "replay:window", "replay-window", no_probe=True)
+    yield folder
+
+
+@pytest.fixture(scope="session")
+def published_run(board_runs: Path) -> boards.Files:
+    """The files of a run that `publish-results` published."""
+    return boards.published(board_runs / "mine")

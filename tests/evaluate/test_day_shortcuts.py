@@ -20,16 +20,16 @@ QUERY = DayCues("day-k2", day_id(30, "test", 0), "MoveCube", "easy", "recall", 0
 
 def of_days(*queries: DayCues) -> list[DayCues]:
     """The queries, each of another day."""
-    return [replace(one, day=day_id(30, "test", n)) for n, one in enumerate(queries)]
+    return [replace(query, day=day_id(30, "test", n)) for n, query in enumerate(queries)]
 
 
 def measured(queries: list[DayCues], target: str, ability: str, cue: str) -> DayShortcut:
-    [one] = [
-        one
-        for one in day_shortcuts(queries)
-        if (one.target, one.ability, one.cue) == (target, ability, cue)
+    [found] = [
+        shortcut
+        for shortcut in day_shortcuts(queries)
+        if (shortcut.target, shortcut.ability, shortcut.cue) == (target, ability, cue)
     ]
-    return one
+    return found
 
 
 def test_a_clock_that_is_the_answer_reveals_it() -> None:
@@ -62,7 +62,7 @@ def test_each_ability_is_counted_by_itself() -> None:
     absent = measured(queries, "ability", "absent", "task")
     assert (absent.queries, absent.right) == (6, 6) and absent.p < 0.05
     assert absent.expected == pytest.approx(6 * 5 / 11, abs=0.2)
-    answers = {one.ability for one in day_shortcuts(queries) if one.target == "answer"}
+    answers = {found.ability for found in day_shortcuts(queries) if found.target == "answer"}
     assert answers == {"recall", ALL}
     table = day_shortcut_table([*day_shortcuts(queries)], "title")
     assert [row[2] for row in table.rows] == ["recall", ALL, "recall", "absent", ALL]

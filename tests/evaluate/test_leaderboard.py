@@ -1,14 +1,13 @@
-"""Leaderboards: twelve rules, each broken once, and what accepted submissions become."""
+"""Leaderboards: what accepted submissions become, and the page."""
 
 import json
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from support import boards
 from support.boards import BOARD, SYSTEM, Files
 from support.browser import open_page
@@ -16,20 +15,16 @@ from support.hub_server import HubServer
 from support.messages import raises
 from support.scoring import BASE, OWN, RELEASED, RETRIEVAL, ROOT
 
-from robomme_interference_data.errors import FormatError, InvalidOptionError
+from robomme_interference_data.errors import FormatError
 from robomme_interference_data.evaluate.leaderboard.entries import (
     BoardStanding,
     PublishedRun,
-    Submission,
-    add_submission,
     read_entries,
 )
 from robomme_interference_data.evaluate.leaderboard.plain_values import letter
-from robomme_interference_data.evaluate.leaderboard.published import RATES, Results, ranked_by
-from robomme_interference_data.evaluate.leaderboard.rules import RULES
+from robomme_interference_data.evaluate.leaderboard.published import Results, ranked_by
 from robomme_interference_data.evaluate.leaderboard.site import (
     Leaderboard,
-    check_all,
     make_leaderboard,
     write_site,
 )
@@ -38,196 +33,12 @@ Run = Callable[..., tuple[int, str, str]]
 REPOSITORY = "someone/results"
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """Runs of three policies: one to submit, one with another memory, and a control."""
-    folder = tmp_path_factory.mktemp("runs")
-    with pytest.MonkeyPatch.context() as patch:
-        boards.use_tiny(patch)
-        boards.make_run(folder / "mine", "replay:framesamp", SYSTEM)
-        boards.make_run(folder / "other", "replay:full", "other-memory")
-        boards.make_run(folder / "window", "replay:window", "replay-window", no_probe=True)
-    yield folder
-
-
-@pytest.fixture(scope="module")
-def good(made: Path) -> Files:
-    return boards.published(made / "mine")
-
-
-Broken = tuple[Files, dict[str, Any]]
-"""Files of a repository, and what its entry states otherwise."""
-
-
-def with_rows(files: Files, folder: Path, **values: Any) -> Broken:
-    return boards.changed(files, folder, row=lambda row: row | values), {}
-
-
-def incomplete(files: Files, folder: Path) -> Broken:
-    def without(row: dict[str, Any]) -> dict[str, Any]:
-        return {} if (row["family"], row["condition"]) == ("MoveCube", "k7") else row
-
-    return boards.changed(files, folder, row=without), {}
-
-
-def broken_rollouts(files: Files, folder: Path) -> Broken:
-    def broken(row: dict[str, Any]) -> dict[str, Any]:
-        error = {"status": "error", "success": None, "error": "it broke"}
-        return row | error if row["condition"] == "k7" else row
-
-    return boards.changed(files, folder, row=broken), {}
-
-
-def with_probe(files: Files, folder: Path, probe: dict[str, Any] | None) -> Broken:
-    def other(header: dict[str, Any]) -> dict[str, Any]:
-        return header | {"probe": None if probe is None else header["probe"] | probe}
-
-    return boards.changed(files, folder, header=other), {}
-
-
-def shorter_histories(files: Files, folder: Path) -> Broken:
-    def shorter(row: dict[str, Any]) -> dict[str, Any]:
-        return row | {"history_frames": max(row["history_frames"] - 1, 0)}
-
-    return boards.changed(files, folder, row=shorter), {}
-
-
-def other_rates(files: Files, folder: Path) -> Broken:
-    text = files[RATES].decode().replace(",0.000000,", ",0.900000,").replace(",1.000000,", ",0.9,")
-    return files | {RATES: text.encode()}, {}
-
-
-BAD: dict[int, Callable[[Files, Path], Broken]] = {
-    1: lambda files, folder: with_rows(files, folder, protocol_version=2),
-    2: lambda files, folder: with_rows(files, folder, revision="cd" * 32),
-    3: incomplete,
-    4: lambda files, folder: (files, {"runs": 2}),
-    5: broken_rollouts,
-    6: lambda files, folder: with_probe(files, folder, None),
-    7: lambda files, folder: with_probe(
-        files, folder, {"verdict": "broken", "error": "the server left"}
-    ),
-    8: shorter_histories,
-    9: lambda files, folder: (files, {"commit": "main"}),
-    10: lambda files, folder: (files, {"checkpoint_sha256": "abc"}),
-    11: other_rates,
-    12: lambda files, folder: (files, {"memory": "none"}),
-}
-"""How each rule is broken, by number."""
-
-ALSO = {1: {11}}
-"""Rows of another protocol cannot be scored either."""
-
-
-@pytest.mark.parametrize("number", BAD)
-def test_each_rule_is_broken_once(number: int, good: Files, hub: HubServer, tmp_path: Path) -> None:
-    files, stated = BAD[number](good, tmp_path / "bad")
-    commit = hub.push(f"datasets/{REPOSITORY}", files)
-    results = f"{REPOSITORY}@{stated.pop('commit', commit)}"
-    entry = boards.submission(*[results] * stated.pop("runs", 1), **stated)
-    path = boards.write_board(tmp_path / "results.yaml", entry)
-    problems = check_all(read_entries(path))
-    assert {problem.rule.number for problem in problems} == {number} | ALSO.get(number, set())
-
-
-def test_what_is_not_accepted_is_listed(
-    good: Files, hub: HubServer, tmp_path: Path, run: Run
-) -> None:
-    commit = hub.push(f"datasets/{REPOSITORY}", good)
-    entry = boards.submission(f"{REPOSITORY}@{commit}", checkpoint_sha256="abc", memory="none")
-    path = boards.write_board(tmp_path / "results.yaml", entry)
-    problems = check_all(read_entries(path))
-    assert [problem.rule.number for problem in problems] == [10, 12]
-    for words in (("submit", path, "--check"), ("leaderboard", path, "--out", tmp_path / "site")):
-        code, out, err = run(*words)
-        assert (code, out) == (int(words[0] == "submit"), "")
-        assert all(str(problem) in err and problem.rule.fix in err for problem in problems)
-    page = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
-    assert "Not accepted" in page
-    refused = json.loads((tmp_path / "site" / "leaderboard.json").read_text())["refused"]
-    assert [problem["rule"] for problem in refused] == [10, 12]
-
-
-def test_rules_are_twelve() -> None:
-    assert [rule.number for rule in RULES] == list(range(1, 13)) == sorted(BAD)
-
-
-@pytest.mark.parametrize(
-    ("location", "part"),
-    [
-        ("someone/nothing@" + "0" * 40, "does not exist"),
-        (f"{REPOSITORY}@" + "0" * 40, "no revision"),
-        (f"{REPOSITORY}@data-1.0.0", "40 digits"),
-    ],
-)
-def test_what_the_hub_does_not_have(
-    location: str, part: str, good: Files, hub: HubServer, tmp_path: Path
-) -> None:
-    hub.push(f"datasets/{REPOSITORY}", good)
-    entry = boards.submission(location, checkpoint_sha256="abc")
-    problems = check_all(read_entries(boards.write_board(tmp_path / "results.yaml", entry)))
-    # What needs no rows is checked at once.
-    assert [problem.rule.number for problem in problems] == [9, 10]
-    assert part in problems[0].what
-
-
-@pytest.mark.parametrize("name", ["rollouts.parquet", RATES, "README.md"])
-@pytest.mark.parametrize("data", [b"", b"nothing of it", b"\xff\x00,"])
-def test_damaged_files_of_a_repository(
-    name: str, data: bytes, good: Files, hub: HubServer, tmp_path: Path
-) -> None:
-    commit = hub.push(f"datasets/{REPOSITORY}", good | {name: data})
-    entry = boards.submission(f"{REPOSITORY}@{commit}")
-    problems = check_all(read_entries(boards.write_board(tmp_path / "results.yaml", entry)))
-    assert {problem.rule.number for problem in problems} == {11}
-
-
-def test_names_are_unique_on_a_board(
-    good: Files, made: Path, hub: HubServer, tmp_path: Path
-) -> None:
-    commit = hub.push(f"datasets/{REPOSITORY}", good)
-    entry = boards.submission(f"{REPOSITORY}@{commit}")
-    path = boards.write_board(tmp_path / "results.yaml", entry, entry)
-    assert [problem.rule.number for problem in check_all(read_entries(path))] == [12]
-    control = {"board": BOARD, "rows": [str(made / "mine")], "standing": "control"}
-    path = boards.write_board(tmp_path / "results.yaml", entry, references=[control])
-    assert [problem.rule.number for problem in check_all(read_entries(path))] == [12]
-
-
-def test_a_policy_that_knows_the_answer_is_no_submission(
-    good: Files, hub: HubServer, tmp_path: Path
-) -> None:
-    def privileged(header: dict[str, Any]) -> dict[str, Any]:
-        header["invocations"][0]["policy"]["privileged"] = True
-        return header
-
-    files = boards.changed(good, tmp_path / "bad", header=privileged)
-    commit = hub.push(f"datasets/{REPOSITORY}", files)
-    path = boards.write_board(
-        tmp_path / "results.yaml", boards.submission(f"{REPOSITORY}@{commit}")
-    )
-    assert [problem.rule.number for problem in check_all(read_entries(path))] == [12]
-
-
-def test_a_board_without_a_buffer_set_takes_no_submission(
-    good: Files, hub: HubServer, tmp_path: Path
-) -> None:
-    commit = hub.push(f"datasets/{REPOSITORY}", good)
-    board = {"name": BOARD, "simulator": "support.worlds:World"}
-    entry = boards.submission(f"{REPOSITORY}@{commit}")
-    path = boards.write_board(tmp_path / "results.yaml", entry, boards=[board])
-    assert [problem.rule.number for problem in check_all(read_entries(path))] == [2]
-
-
-# --- what is accepted ----------------------------------------------------------------------------
-
-
 @pytest.fixture
-def listed(good: Files, made: Path, hub: HubServer, tmp_path: Path) -> Path:
+def listed(published_run: Files, board_runs: Path, hub: HubServer, tmp_path: Path) -> Path:
     """A file with two submissions, a control, and results of another program."""
-    mine = hub.push(f"datasets/{REPOSITORY}", good)
-    other = hub.push("datasets/someone/other", boards.published(made / "other"))
-    control = {"board": BOARD, "rows": [str(made / "window")], "standing": "control"}
+    mine = hub.push(f"datasets/{REPOSITORY}", published_run)
+    other = hub.push("datasets/someone/other", boards.published(board_runs / "other"))
+    control = {"board": BOARD, "rows": [str(board_runs / "window")], "standing": "control"}
     return boards.write_board(
         tmp_path / "results.yaml",
         boards.submission(f"{REPOSITORY}@{mine}", parameters=1300000, trained_on="interference"),
@@ -269,11 +80,13 @@ def test_a_leaderboard(listed: Path, hub: HubServer, tmp_path: Path, run: Run) -
     assert before == {path: path.read_bytes() for path in before}
 
 
-def test_training_runs_are_one_system(good: Files, hub: HubServer, tmp_path: Path) -> None:
+def test_training_runs_are_one_system(published_run: Files, hub: HubServer, tmp_path: Path) -> None:
     locations = []
     for seed in range(2):
         files = boards.changed(
-            good, tmp_path / str(seed), row=lambda row, seed=seed: row | {"training_seed": seed}
+            published_run,
+            tmp_path / str(seed),
+            row=lambda row, seed=seed: row | {"training_seed": seed},
         )
         commit = hub.push(f"datasets/someone/seed-{seed}", files)
         locations.append(f"someone/seed-{seed}@{commit}")
@@ -284,11 +97,11 @@ def test_training_runs_are_one_system(good: Files, hub: HubServer, tmp_path: Pat
     assert system["success"]["k7"]["training_runs"] == len(system["runs"]) == 2
 
 
-def test_videos_are_linked(good: Files, hub: HubServer, tmp_path: Path) -> None:
+def test_videos_are_linked(published_run: Files, hub: HubServer, tmp_path: Path) -> None:
     def filmed(row: dict[str, Any]) -> dict[str, Any]:
         return row | {"video": "videos/a.mp4"} if row["condition"] == "k7" else row
 
-    files = boards.changed(good, tmp_path / "filmed", row=filmed)
+    files = boards.changed(published_run, tmp_path / "filmed", row=filmed)
     names = {"rows": "rollouts.parquet", "card": "README.md"}
     for more, expected in (({}, names), ({"videos/a.mp4": b""}, {**names, "videos": "videos"})):
         commit = hub.push(f"datasets/{REPOSITORY}", files | more)
@@ -301,7 +114,9 @@ def test_videos_are_linked(good: Files, hub: HubServer, tmp_path: Path) -> None:
         }
 
 
-def test_results_of_other_programs_are_not_ranked(tmp_path: Path, made: Path, run: Run) -> None:
+def test_results_of_other_programs_are_not_ranked(
+    tmp_path: Path, board_runs: Path, run: Run
+) -> None:
     tasks = [{"task_group": "libero", "task_id": 0, "metrics": {"successes": [True, False]}}]
     (tmp_path / "eval_info.json").write_text(json.dumps({"per_task": tasks}))
     board = {"name": "libero", "simulator": "libero"}
@@ -318,9 +133,9 @@ def test_results_of_other_programs_are_not_ranked(tmp_path: Path, made: Path, ru
     assert system["outcomes"] == {"no-history": "sf"}
 
 
-def test_boards_do_not_mix_simulators(made: Path, tmp_path: Path) -> None:
+def test_boards_do_not_mix_simulators(board_runs: Path, tmp_path: Path) -> None:
     board = {"name": BOARD, "simulator": "tabletop"}
-    control = {"board": BOARD, "rows": [str(made / "window")], "standing": "control"}
+    control = {"board": BOARD, "rows": [str(board_runs / "window")], "standing": "control"}
     path = boards.write_board(tmp_path / "results.yaml", boards=[board], references=[control])
     with raises(FormatError):
         make_leaderboard(read_entries(path))
@@ -462,107 +277,3 @@ def test_the_page_in_a_browser(tmp_path: Path) -> None:
         # Each column of differences is that of its control.
         heads = "[...document.querySelectorAll('h3 + section thead th')].map(e => e.textContent)"
         assert page.run(heads)[:2] == ["system", "Guess"]
-
-
-# --- the command that adds a submission ----------------------------------------------------------
-
-
-def test_submit(good: Files, hub: HubServer, tmp_path: Path, run: Run) -> None:
-    commit = hub.push(f"datasets/{REPOSITORY}", good, "data-1.0.0")
-    path = boards.write_board(tmp_path / "results.yaml")
-    before = path.read_text(encoding="utf-8")
-    (tmp_path / "policy.py").write_text("pass\n")
-    words = ["submit", path, "--results", f"{REPOSITORY}@data-1.0.0", "--memory", "frames"]
-    code, _, err = run(*words)
-    assert code == 1
-    for option in ("--checkpoint", "--weights", "--trained-on"):
-        assert option in err
-    words += ["--checkpoint", "someone/model", "--weights", tmp_path / "policy.py"]
-    words += ["--trained-on", "nothing"]
-    code, _, err = run(*words, "--check")
-    assert code == 0 and path.read_text(encoding="utf-8") == before, err
-    code, _, err = run(*words)
-    assert code == 0, err
-    [added] = yaml.safe_load(path.read_text(encoding="utf-8"))["submissions"]
-    assert (added["system"], added["board"]) == (SYSTEM, BOARD)
-    assert added["runs"][0]["results"] == f"{REPOSITORY}@{commit}"
-    assert len(added["runs"][0]["checkpoint_sha256"]) == 64
-    assert run("submit", path, "--check")[0] == 0
-    # The same name a second time.
-    after = path.read_text(encoding="utf-8")
-    assert run(*words)[0] == 1 and path.read_text(encoding="utf-8") == after
-    assert run("submit", path)[0] == 1
-
-
-ENTRY = Submission(
-    system="mine",
-    board=BOARD,
-    memory="none",
-    trained_on="other",
-    runs=(PublishedRun("a/b@" + "0" * 40, "weights", "ab" * 32),),
-    contact="me: @example",
-)
-
-
-@pytest.mark.parametrize("end", ["submissions:\n", "submissions: []\n", "submissions: [] ", ""])
-def test_an_entry_is_added_at_the_end(tmp_path: Path, end: str) -> None:
-    path = tmp_path / "results.yaml"
-    head = f"# Kept.\nboards:\n- name: {BOARD}  # as it is\n  simulator: tabletop\n"
-    path.write_text(head + end)
-    for number in range(1, 3):
-        add_submission(path, ENTRY)
-        assert read_entries(path).submissions == (ENTRY,) * number
-        assert path.read_text().startswith(head)
-
-
-def test_an_entry_is_not_added_in_the_middle(tmp_path: Path) -> None:
-    path = tmp_path / "results.yaml"
-    text = f"submissions: []\nboards:\n- name: {BOARD}\n  simulator: tabletop\n"
-    path.write_text(text)
-    with raises(InvalidOptionError):
-        add_submission(path, ENTRY)
-    assert path.read_text() == text
-
-
-WRONG_FIELDS = (
-    "boards: 3",
-    "boards:\n- name: a",
-    "boards:\n- name: a\n  simulator: b\n  more: c",
-    "boards: []\nreferences:\n- {board: a, rows: [b], standing: submission}",
-    "boards: []\nother: 1",
-)
-
-
-def test_the_json_schema() -> None:
-    schema = json.loads(boards.SCHEMA.read_text(encoding="utf-8"))
-    assert schema == boards.json_schema()
-    jsonschema = pytest.importorskip("jsonschema")
-    check = jsonschema.Draft202012Validator(schema)
-    whole = yaml.safe_load((ROOT / "docs" / "leaderboard" / "results.yaml").read_text("utf-8"))
-    assert check.is_valid(whole)
-    assert check.is_valid({**whole, "submissions": [boards.submission("a/b@" + "0" * 40)]})
-    assert not check.is_valid({**whole, "submissions": [boards.submission("a", memory="good")]})
-    assert not any(check.is_valid(yaml.safe_load(text)) for text in WRONG_FIELDS)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        *WRONG_FIELDS,
-        "boards: [",
-        "- a",
-        "boards:\n- {name: a b, simulator: c}",
-        "boards: 2026-13-45",
-        "boards: 0001-01-01T00:00:00+23:59",
-        "boards: &x [*x]",
-        "? [a]\n: b",
-        pytest.param("[" * 5000, id="deep"),
-        "boards:\n- &a {name: a, simulator: b}\n- *a",
-        "boards: []\nreferences:\n- {board: a, rows: [b], standing: control}",
-    ],
-)
-def test_a_wrong_file(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "results.yaml"
-    path.write_text(text)
-    with raises(FormatError):
-        read_entries(path)

@@ -110,7 +110,7 @@ def test_controls(successes: Counter[tuple[str, str]]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("file", "one", "other", "gained", "lost"),
+    ("file", "first", "second", "gained", "lost"),
     [
         ("asked", ("observer-framesamp-32", "day-cut-k7"), ("observer-framesamp-32", LAST), 8, 5),
         ("acted", ("replay-framesamp", "day-alone"), ("replay-framesamp", LAST), 0, 29),
@@ -118,7 +118,7 @@ def test_controls(successes: Counter[tuple[str, str]]) -> None:
     ],
 )
 def test_paired_changes(
-    file: str, one: tuple[str, str], other: tuple[str, str], gained: int, lost: int
+    file: str, first: tuple[str, str], second: tuple[str, str], gained: int, lost: int
 ) -> None:
     rows = pq.read_table(FOLDER / f"{file}.parquet").to_pylist()
     before, after = (
@@ -127,7 +127,7 @@ def test_paired_changes(
             for row in rows
             if (row["system"], row["condition"]) == key
         }
-        for key in (one, other)
+        for key in (first, second)
     )
     assert before.keys() == after.keys()
     changes = Counter((before[query], after[query]) for query in before)

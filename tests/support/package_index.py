@@ -50,7 +50,7 @@ class PackageIndex(LoopbackServer):
     def add(self, name: str, owner: str, *files: Path) -> None:
         """Register a name with files, as if they had been uploaded before."""
         self.projects[normalized(name)] = Project(
-            owner, {one.name: one.read_bytes() for one in files}
+            owner, {file.name: file.read_bytes() for file in files}
         )
 
     def answer(self, request: Request) -> Answer:

@@ -94,7 +94,7 @@ def test_the_notebook_for_colab_has_the_cells_of_the_tutorial() -> None:
     script = runpy.run_path(str(ROOT / "scripts" / "colab_notebook.py"))
     assert script["updated"]() == COLAB.read_text(encoding="utf-8")
     tutorial = {cell["id"] for cell in script["read"](script["TUTORIAL"])["cells"]}
-    shared = [one["id"] for one in script["read"](COLAB)["cells"] if one["id"] in tutorial]
+    shared = [cell["id"] for cell in script["read"](COLAB)["cells"] if cell["id"] in tutorial]
     assert len(shared) == 7
 
 

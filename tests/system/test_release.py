@@ -205,7 +205,7 @@ def test_every_step_of_an_image_is_a_script_that_is_run_without_docker(release: 
 
 @pytest.mark.slow
 def test_the_step_of_the_light_image_runs(release: Any, tmp_path: Path) -> None:
-    [[program, _]] = [one for one in release.run_lines(DOCKERFILE) if one[0] not in SET_UP]
+    [[program, _]] = [line for line in release.run_lines(DOCKERFILE) if line[0] not in SET_UP]
     command = [ROOT / program, tmp_path / "light"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=500, check=False)
     if "No matching distribution" in done.stderr:
@@ -251,8 +251,8 @@ def test_images_get_no_file_that_git_ignores() -> None:
 
     # Without a slash before its end git ignores it in every folder, Docker only at the top.
     expected = [
-        f"**/{one}" if "/" not in one.rstrip("/") else one.removeprefix("/")
-        for one in patterns(".gitignore")
+        f"**/{name}" if "/" not in name.rstrip("/") else name.removeprefix("/")
+        for name in patterns(".gitignore")
     ]
     assert patterns(".dockerignore") == expected
 
@@ -267,7 +267,7 @@ def test_everybody_develops_in_the_same_image() -> None:
 
 # --- what GitHub shows ---------------------------------------------------------------------------
 
-FORMS = [one for one in (ROOT / ".github/ISSUE_TEMPLATE").glob("*.yml") if one.stem != "config"]
+FORMS = [form for form in (ROOT / ".github/ISSUE_TEMPLATE").glob("*.yml") if form.stem != "config"]
 
 
 @pytest.mark.parametrize("path", FORMS, ids=lambda path: path.stem)
