@@ -16,7 +16,7 @@ from support.policy_server import Memory, PolicyServer, RetraceMemory
 from support.runs import header, run
 from support.serve_policy import command
 
-from robomme_interference_data.errors import LeakError
+from robomme_interference_data.errors import FormatError, LeakError
 from robomme_interference_data.evaluate.language import subgoal_settings
 from robomme_interference_data.evaluate.language.subgoal_writers import OracleWriter
 from robomme_interference_data.evaluate.probe.judgment import ProbeVerdict, first_difference, judge
@@ -181,7 +181,7 @@ def test_flips_are_counted_after_the_same_rollout_only() -> None:
 
 
 def test_the_probe_of_merged_shards_is_the_weakest_and_names_those_without() -> None:
-    good, noisy = (Probe(verdict, (), 3, 1) for verdict in ("independent", "nondeterministic"))
+    good, noisy = Probe("independent", (), 3, 1), Probe("nondeterministic", (), 3, 1, p_value=0.4)
     assert joined_probe([("one", good), ("two", noisy)]) == noisy
     assert joined_probe([("one", None)]) is None
     some = joined_probe([("one", good), ("two", None)])
@@ -190,6 +190,12 @@ def test_the_probe_of_merged_shards_is_the_weakest_and_names_those_without() -> 
     assert probe_text(some).endswith("after any predecessor; not probed: two")
     again = joined_probe([("merged", some), ("three", None), ("four", good)])
     assert again is not None and again.unprobed == ("three", "two")
+
+
+@pytest.mark.parametrize("values", [{"verdict": "fine"}, {"verdict": "nondeterministic"}])
+def test_what_is_no_verdict(values: dict[str, Any]) -> None:
+    with raises(FormatError):
+        Probe(rollouts=(), plays=3, clients=1, **values)
 
 
 # --- runs ----------------------------------------------------------------------------------------

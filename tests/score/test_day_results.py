@@ -161,5 +161,9 @@ def test_shortcuts() -> None:
         for cue, line in found.items():
             assert row[cue] == f"{line['right']} ({float(line['expected']):.1f})"
     answers = [row for row in rows if row["target"] == "answer" and row["ability"] != "all"]
+    [update] = [row for row in answers if (row["ability"], row["cue"]) == ("update", "task")]
+    assert min(answers, key=lambda row: float(row["p"])) == update
+    stated = f"{update['right']} of {update['queries']} right, {float(update['expected']):.1f}"
+    assert stated in PAGE and f"p = {float(update['p']):.4f} uncorrected" in PAGE
     least = min(holm([float(row["p"]) for row in answers]))
     assert f"{len(answers)} tests of the answers is {least:.2f}" in PAGE
