@@ -17,6 +17,9 @@ from robomme_interference_data.evaluate.systems import SYSTEMS
 
 RATES = made.RELEASED.parent / "by_family_condition.csv"
 NO_ROWS = {
+    "day/ceilings.csv",
+    "day/retrieval.csv",
+    "day/shortcuts.csv",
     "robomme/ceilings.csv",
     "robomme/lessons.parquet",
     "robomme/shortcuts.csv",
