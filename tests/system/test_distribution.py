@@ -1,6 +1,6 @@
 """What is published of the package: sdist and wheel, which `make bare` uses."""
 
-import shutil
+import re
 import subprocess
 import sys
 import tarfile
@@ -9,27 +9,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.package import CONFIG, PACKAGE, ROOT, committable, module_files
+from support.package import CONFIG, PACKAGE, ROOT, module_files
 
 pytestmark = pytest.mark.slow  # test_packaging.py compares the lists of files
-
-
-def build(tree: Path, out: Path, *kind: str) -> None:
-    """Run `python -m build`, with the setuptools that is here."""
-    command = [sys.executable, "-m", "build", "--no-isolation", *kind, "--outdir", str(out)]
-    done = subprocess.run([*command, str(tree)], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "WARNING" not in done.stdout + done.stderr
 
 
 @pytest.fixture(scope="module")
 def distributions(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An sdist, and the wheel that is built from it, as they are published."""
     folder = tmp_path_factory.mktemp("distributions")
-    for name in committable():
-        (folder / "tree" / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(ROOT / name, folder / "tree" / name)
-    build(folder / "tree", folder / "dist")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(ROOT / "scripts")
+        from distribution import copy_source
+    copy_source(folder / "tree")
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder / "dist")]
+    done = subprocess.run(
+        [*command, str(folder / "tree")], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "WARNING" not in done.stdout + done.stderr
     return folder / "dist"
 
 
@@ -53,6 +51,21 @@ def test_the_sdist_holds_what_the_wheel_needs_and_nothing_else(distributions: Pa
     own = {path.relative_to(ROOT).as_posix() for path in module_files().values()}
     made = {name for name in found if ".egg-info/" in name} | {"PKG-INFO", "setup.cfg"}
     assert found - made == own | {"LICENSE", "README.md", "pyproject.toml"}
+
+
+def test_links_of_the_description_lead_to_files_of_the_repository(distributions: Path) -> None:
+    (wheel,) = distributions.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        [metadata] = [name for name in archive.namelist() if name.endswith("/METADATA")]
+        description = archive.read(metadata).decode().partition("\n\n")[2]
+    links = re.findall(r"\]\(([^)#]+)\)", description)
+    assert all(link.startswith("https://") for link in links)
+    page = CONFIG["project"]["urls"]["Repository"]
+    own = [link.removeprefix(page).split("/", 3) for link in links if link.startswith(page)]
+    files = {(kind, tag, path) for _, kind, tag, path in own if kind in ("blob", "raw")}
+    tag = f"v{CONFIG['project']['version']}"
+    assert {("raw", tag, "docs/pictures/headline.png"), ("blob", tag, "LICENSE")} <= files
+    assert all((ROOT / path).is_file() for *_, path in files)
 
 
 def test_twine_uploads_both_and_uv_installs_them_by_name(

@@ -8,7 +8,12 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema.days import DayPlan, ability_of, goal_in_day
+from robomme_interference_data.schema.days import (
+    DAY_RULE_VERSION,
+    DayPlan,
+    ability_of,
+    goal_in_day,
+)
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.shifts import NO_SHIFT
 from robomme_interference_data.schema.subgoal import Subgoal
@@ -42,7 +47,7 @@ class TabletopDaySimulator(TabletopSimulator):
     )
     own_episodes = True
     try_out = False
-    suite_version = 1
+    suite_version = DAY_RULE_VERSION
 
     def __init__(self, cameras: Sequence[str] = CAMERAS, shift: str = NO_SHIFT):
         super().__init__(cameras, shift)
