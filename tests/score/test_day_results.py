@@ -9,6 +9,7 @@ from support import scoring as made
 from support.pages import RESULTS, table
 
 from robomme_interference_data.constants import ABILITIES, PROTOCOL_VERSION
+from robomme_interference_data.schema.days import LEAST_FRAMES
 from robomme_interference_data.stats.significance import holm
 
 PAGE = (RESULTS / "day.md").read_text(encoding="utf-8")
@@ -20,6 +21,18 @@ LAST = "day-k7"
 def read(name: str) -> list[dict[str, str]]:
     with (FOLDER / name).open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
+
+
+def test_spans_of_the_days() -> None:
+    """`build` says whether a day's buffers can fit before it plays the day: by `LEAST_FRAMES`."""
+    spans = read("spans.csv")
+    frames = Counter[str]()
+    for span in spans:
+        least = LEAST_FRAMES.get(span["part"], 10)
+        assert int(span["frames"]) >= least, span
+        frames[span["day"].split("/")[1]] += int(span["frames"])
+    assert {span["part"] for span in spans} == {"transition", *LEAST_FRAMES}
+    assert f"{frames['test']:,} frames ({frames['test'] / 600:.0f} minutes)" in PAGE
 
 
 def ceilings(part: str, condition: str) -> dict[str, dict[str, str]]:
