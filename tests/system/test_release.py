@@ -215,6 +215,15 @@ def test_the_step_of_the_light_image_runs(release: Any, tmp_path: Path) -> None:
     assert not [*tmp_path.glob("light/lib/python*/site-packages/torch")]
 
 
+def test_the_light_installation_replaces_no_folder_of_yours(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("a year of work")
+    command = [ROOT / "scripts" / "install_light.sh", "mine"]  # as seen from where it is run
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and str(tmp_path / "mine") in done.stderr
+    assert (tmp_path / "mine" / "thesis.txt").exists()
+
+
 def test_images_are_built_where_docker_answers(
     release: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
