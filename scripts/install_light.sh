@@ -4,10 +4,13 @@
 #
 #     scripts/install_light.sh FOLDER
 set -euo pipefail
-cd "$(dirname "${BASH_SOURCE[0]}")/.."
-
 [[ $# == 1 ]] || { echo "usage: scripts/install_light.sh FOLDER" >&2; exit 2; }
-folder=$1
+folder=$(realpath -m -- "$1")
+[[ ! -e $folder || -f $folder/pyvenv.cfg ]] || {
+  echo "install_light: $folder is no environment, and is kept: give a new folder" >&2
+  exit 1
+}
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
 rm -rf "$folder"
 python3 -m venv "$folder"
 "$folder/bin/python" -m pip install -qq --disable-pip-version-check --root-user-action ignore \

@@ -26,6 +26,9 @@ from distribution import ROOT, build, configured_index
 IMAGES = ("light", "full")
 """Targets of the Dockerfile."""
 
+VERSION = re.compile(r"\d+\.\d+\.\d+(rc\d+)?")
+"""As in 0.1.0 or 0.1.0rc1, in the form that indexes keep; its tag has a v in front."""
+
 NOTES = "build/release-notes.md"
 """Where the changelog's newest section is written."""
 
@@ -34,8 +37,9 @@ def main() -> None:
     """Run every step; exit with an error at the first one that fails."""
     project = project_of(ROOT)
     version = sys.argv[1]
-    if not version:
-        sys.exit(f"release: which version? Run: make release VERSION={project['version']}")
+    if not VERSION.fullmatch(version):
+        given = f"version {version!r}; expected three numbers" if version else "which version?"
+        sys.exit(f"release: {given}. Run: make release VERSION={project['version']}")
     index = configured_index()
     problems = [*disagreements(ROOT, version), *name_problems(index, project, version)]
     if problems:

@@ -87,6 +87,7 @@ class Reference:
     trained_on: Annotated[str | None, "As in a submission, or None if unknown."] = None
 
     def __post_init__(self) -> None:
+        _check_not_empty("rows", self.rows)
         _check("standing", self.standing, _UNRANKED)
         if self.trained_on is not None:
             _check("trained_on", self.trained_on, TrainedOn)
@@ -123,8 +124,7 @@ class Submission:
     def __post_init__(self) -> None:
         _check("memory", self.memory, MemoryKind)
         _check("trained_on", self.trained_on, TrainedOn)
-        if not self.runs:
-            raise FormatError("runs is empty; expected one or more")
+        _check_not_empty("runs", self.runs)
 
 
 @dataclass(frozen=True)
@@ -151,18 +151,44 @@ def _check(name: str, value: str, known: Any) -> None:
         raise InvalidOptionError.one_of(name, value, [*known])
 
 
+def _check_not_empty(name: str, values: tuple[Any, ...]) -> None:
+    if not values:
+        raise FormatError(f"{name} is empty; expected one or more")
+
+
 def read_entries(path: Path) -> Entries:
     """Read the file of a leaderboard.
 
     Raises:
-        FormatError: It is no YAML, a field is missing, unknown or wrong, or a board is unknown.
+        FormatError: It is no YAML, a field is missing, unknown, wrong or given twice, or a board
+            is unknown.
     """
-    return _parse(read_text(path, _MAX_BYTES), path)
+    text = read_text(path, _MAX_BYTES)
+    try:
+        return _parse(text, path)
+    except FormatError as error:  # people write this file
+        hint = "Correct it: docs/how-to/leaderboard.md shows such a file."
+        raise FormatError(error.message, hint) from None
+
+
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]
+    """Refuses names that are given twice: YAML keeps the last, and drops what the first listed."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        names = set[str]()
+        for key, _ in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                continue
+            if key.value in names:
+                line = key.start_mark.line + 1
+                raise yaml.YAMLError(f"{key.value!r} is given twice, again in line {line}")
+            names.add(key.value)
+        return super().construct_mapping(node, deep)
 
 
 def _parse(text: str, path: Path) -> Entries:
     try:
-        content = yaml.safe_load(text)
+        content = yaml.load(text, _Loader)
     # Beside its own errors: a date that does not exist or is too early, and deep nesting.
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         raise FormatError.damaged(path, f"no valid YAML: {error}") from None

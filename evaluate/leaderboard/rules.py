@@ -118,7 +118,8 @@ RULES = (
     SubmissionRule(
         12,
         "one system, as stated",
-        "Choose a name of your own (--system of evaluate), and state what its rows state.",
+        "Choose a name of your own (--system of evaluate) or remove your older entry, and state "
+        "what its rows state.",
         checks.stated_system,
         reads_rows=False,
     ),

@@ -1,6 +1,5 @@
 """A leaderboard: its submissions checked, its boards scored, and the site that shows them."""
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +10,7 @@ from robomme_interference_data.constants import FORMAT_VERSION, OFFICIAL
 from robomme_interference_data.errors import FormatError, InterferenceError, first_line
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
 from robomme_interference_data.evaluate.score.rows.values import Row
-from robomme_interference_data.storage.files import write_json, write_text
+from robomme_interference_data.storage.files import all_files, write_json, write_text
 from robomme_interference_data.viz.tables import Columns, Table
 
 from .entries import Board, BoardStanding, Entries
@@ -99,11 +98,13 @@ def write_site(made: Leaderboard, out: Path) -> dict[str, Any]:
             write_text(folder / "rows" / f"{board.board.name}.csv", _rows_table(board).csv())
         write_json(folder / DATA, data)
         write_page(data, folder / PAGE, out)
-        shutil.rmtree(out / "rows", ignore_errors=True)  # of boards that are gone
-        for path in sorted(path for path in folder.rglob("*") if path.is_file()):
-            target = out / path.relative_to(folder)
-            target.parent.mkdir(exist_ok=True)
-            path.replace(target)
+        written = all_files(folder)
+        for path in written:
+            (out / path).parent.mkdir(exist_ok=True)
+            (folder / path).replace(out / path)
+    for path in all_files(out / "rows"):
+        if f"rows/{path}" not in written:  # of a board that is gone
+            (out / "rows" / path).unlink()
     return data
 
 
@@ -124,7 +125,7 @@ def _gather(entries: Entries, board: Board, released: tuple[Path, ...] = ()) -> 
     """Check everything that is listed for a board."""
     gathered = _Gathered(Grid.of(entries, board))
     for reference in [each for each in entries.references if each.board == board.name]:
-        paths = tuple(Path(entries.locate(path)) for path in reference.rows)
+        paths = tuple(entries.folder / path for path in reference.rows)
         rows = BoardRows(paths, reference.system)
         _add(gathered, board, rows, BoardStanding(reference.standing), reference.trained_on)
     if released:

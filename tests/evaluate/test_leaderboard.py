@@ -15,7 +15,7 @@ from support.hub_server import HubServer
 from support.messages import raises
 from support.scoring import BASE, OWN, RELEASED, RETRIEVAL, ROOT
 
-from robomme_interference_data.errors import FormatError
+from robomme_interference_data.errors import FormatError, MissingFileError
 from robomme_interference_data.evaluate.leaderboard.entries import (
     BoardStanding,
     PublishedRun,
@@ -131,6 +131,41 @@ def test_results_of_other_programs_are_not_ranked(
     [system] = made_board["systems"]
     assert (system["system"], system["standing"], system["rank"]) == ("act", "unverified", None)
     assert system["outcomes"] == {"no-history": "sf"}
+
+
+def test_rows_lie_beside_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not in the working directory: the same file must mean the same rows everywhere."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rows.csv").write_text("system\n")
+    (tmp_path / "board").mkdir()
+    board = {"name": "own", "simulator": "mine"}
+    control = {"board": "own", "rows": ["rows.csv"], "standing": "control"}
+    path = boards.write_board(tmp_path / "board" / "r.yaml", boards=[board], references=[control])
+    with raises(MissingFileError):
+        make_leaderboard(read_entries(path))
+
+
+def test_an_interrupted_site_lacks_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each file is replaced by its new version; rows of boards that are gone are deleted last."""
+    made = boards.made_up(tmp_path)
+    out = tmp_path / "site"
+    write_site(made, out)
+    (out / "rows" / "gone.csv").write_text("rows of a board that is gone\n")
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+    replace_file = Path.replace
+
+    def stop(source: Path, target: Path) -> Path:
+        if target.parent == out:
+            raise KeyboardInterrupt
+        return replace_file(source, target)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Path, "replace", stop)
+        write_site(made, out)
+    assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    write_site(made, out)
+    assert sorted(path.name for path in out.rglob("*.csv")) == [f"{BOARD}.csv"]
 
 
 def test_boards_do_not_mix_simulators(board_runs: Path, tmp_path: Path) -> None:

@@ -116,6 +116,10 @@ def test_the_json_schema() -> None:
         pytest.param("[" * 5000, id="deep"),
         "boards:\n- &a {name: a, simulator: b}\n- *a",
         "boards: []\nreferences:\n- {board: a, rows: [b], standing: control}",
+        "boards:\n- {name: a, simulator: b}\nreferences: [{board: a, rows: [], standing: control}]",
+        # YAML would keep the second list, and so lose the entries of the first.
+        "boards:\n- {name: a, simulator: b}\nsubmissions: []\nsubmissions: []",
+        "boards:\n- {name: a, simulator: b, name: c}",
     ],
 )
 def test_a_wrong_file(tmp_path: Path, text: str) -> None:

@@ -108,7 +108,7 @@ def test_the_notes_are_the_changelogs_newest_section(release: Any, checkout: Pat
     assert release.newest_section(checkout) == (f"{VERSION} (2026-12-01)", "- All.\n")
 
 
-@pytest.mark.parametrize("version", ["", "7.0"])
+@pytest.mark.parametrize("version", ["", "7.0.0", "7.0", f"v{VERSION}", f"{VERSION} "])
 def test_the_program_ends_before_it_builds(version: str) -> None:
     """The index is not asked for the version's sake: nothing answers there."""
     own = {"PYTHONPATH": str(ROOT / "tests"), "UV_DEFAULT_INDEX": "http://127.0.0.1:9/simple"}
@@ -118,7 +118,8 @@ def test_the_program_ends_before_it_builds(version: str) -> None:
     )
     assert done.returncode == 1
     assert all(line.startswith("release: ") for line in done.stderr.splitlines())
-    expected = "pyproject.toml has version" if version else f"make release VERSION={VERSION}"
+    agrees = version == "7.0.0"  # with how versions are written
+    expected = "pyproject.toml has version" if agrees else f"make release VERSION={VERSION}"
     assert expected in done.stderr
 
 
@@ -212,6 +213,15 @@ def test_the_step_of_the_light_image_runs(release: Any, tmp_path: Path) -> None:
         pytest.skip("no package index answers")
     assert done.returncode == 0, done.stderr
     assert not [*tmp_path.glob("light/lib/python*/site-packages/torch")]
+
+
+def test_the_light_installation_replaces_no_folder_of_yours(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("a year of work")
+    command = [ROOT / "scripts" / "install_light.sh", "mine"]  # as seen from where it is run
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and str(tmp_path / "mine") in done.stderr
+    assert (tmp_path / "mine" / "thesis.txt").exists()
 
 
 def test_images_are_built_where_docker_answers(
