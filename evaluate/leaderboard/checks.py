@@ -1,6 +1,7 @@
 """The checks of the twelve rules: each yields what does not hold, a sentence each."""
 
 import csv
+import hashlib
 import re
 from collections import Counter
 from collections.abc import Iterator
@@ -206,6 +207,8 @@ def checkpoint(case: Case) -> Iterator[str]:
                 f"{run.results}: checkpoint_sha256 {run.checkpoint_sha256!r}; expected 64 "
                 "hexadecimal digits"
             )
+        elif run.checkpoint_sha256 == hashlib.sha256().hexdigest():
+            yield f"{run.results}: checkpoint_sha256 is that of an empty file"
 
 
 def unchanged(case: Case) -> Iterator[str]:

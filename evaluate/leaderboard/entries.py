@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import yaml
 
-from robomme_interference_data.errors import FormatError, InvalidOptionError
+from robomme_interference_data.errors import FormatError, InvalidOptionError, MissingFileError
 from robomme_interference_data.schema.codec import from_dict, to_dict
 from robomme_interference_data.storage.files import write_text
 from robomme_interference_data.storage.text import read_text
@@ -125,6 +125,8 @@ class Submission:
         _check("memory", self.memory, MemoryKind)
         _check("trained_on", self.trained_on, TrainedOn)
         _check_not_empty("runs", self.runs)
+        if self.parameters is not None and self.parameters < 0:
+            raise InvalidOptionError.expected("parameters", self.parameters, "a number from 0")
 
 
 @dataclass(frozen=True)
@@ -140,10 +142,24 @@ class Entries:
         """Return the board with a name."""
         return next(board for board in self.boards if board.name == name)
 
-    def locate(self, location: str) -> str:
-        """Return a location as it is opened: folders and files relative to the file's folder."""
-        path = self.folder / location
-        return str(path) if path.exists() else location
+    def locate(self, location: str) -> str | Path:
+        """Return a location as it is opened.
+
+        A repository's names its commit, `namespace/name@COMMIT`; any other is a folder, relative to
+        that of the file.
+
+        Raises:
+            MissingFileError: There is no such folder.
+        """
+        if "@" in location:
+            return location
+        folder = self.folder / location
+        if not folder.is_dir():
+            raise MissingFileError(
+                f"there is no folder {folder}",
+                f"Give a folder relative to {self.folder}, or namespace/name@COMMIT.",
+            )
+        return folder
 
 
 def _check(name: str, value: str, known: Any) -> None:
@@ -206,6 +222,8 @@ def _parse(text: str, path: Path) -> Entries:
         )
     if content:
         raise FormatError.damaged(path, f"unknown {', '.join(map(str, content))}")
+    if not parts["boards"]:
+        raise FormatError.damaged(path, "boards: expected one or more")
     entries = Entries(**parts, folder=path.parent)
     names = [board.name for board in entries.boards]
     if twice := next((name for name in names if names.count(name) > 1), None):
@@ -213,7 +231,7 @@ def _parse(text: str, path: Path) -> Entries:
     listed_on: tuple[Reference | Submission, ...] = (*entries.references, *entries.submissions)
     for entry in listed_on:
         if entry.board not in names:
-            known = ", ".join(names) or "none"
+            known = ", ".join(names)
             raise FormatError.damaged(path, f"board {entry.board!r}; the boards are: {known}")
     return entries
 

@@ -97,20 +97,20 @@ class Results:
         rows: The rows that count, in the order of the record.
     """
 
-    def __init__(self, run: PublishedRun, location: str):
+    def __init__(self, run: PublishedRun, entries: Entries):
         self.run = run
         self.fault = ""
         self.paths: frozenset[str] = frozenset()
         try:
-            self._open(location)
+            self._open(entries.locate(run.results))
         except (InterferenceError, OSError) as error:
             self.fault = first_line(error)
 
-    def _open(self, location: str) -> None:
+    def _open(self, location: str | Path) -> None:
         files = locate(location)
         self.on_hub = isinstance(files, HubFiles)
         if isinstance(files, HubFiles):
-            if not _PINNED.fullmatch(location):
+            if not _PINNED.fullmatch(str(location)):
                 raise MissingFileError(
                     f"{location} is not namespace/name@ and the 40 digits of a commit"
                 )
@@ -119,7 +119,7 @@ class Results:
             self._files_at = f"{page}/blob/{files.commit}"
             self._folders_at = f"{page}/tree/{files.commit}"
         else:
-            self.paths = frozenset(all_files(Path(location)))
+            self.paths = frozenset(all_files(files.root))
             self._files_at = self._folders_at = files.location
         if missing := [name for name in NEEDED if name not in self.paths]:
             raise MissingFileError(f"{location} lacks {', '.join(missing)}")
@@ -184,5 +184,5 @@ def open_case(
     entries: Entries, submission: Submission, grid: Grid | None, taken: frozenset[str]
 ) -> Case:
     """Fetch what a submission names."""
-    results = tuple(Results(run, entries.locate(run.results)) for run in submission.runs)
+    results = tuple(Results(run, entries) for run in submission.runs)
     return Case(submission, entries.board(submission.board), grid, results, taken)

@@ -47,7 +47,7 @@ def new_submission(
         PublishedRun(_pinned(entries, location), checkpoint, sha256_file(path))
         for location, checkpoint, path in zip(results, checkpoints, weights, strict=True)
     )
-    opened = Results(runs[0], entries.locate(runs[0].results))
+    opened = Results(runs[0], entries)
     system = opened.rows[0].system if not opened.fault and opened.rows else runs[0].results
     return Submission(
         system=system,

@@ -34,7 +34,7 @@ from .records import DayQuery
 from .shifts import KINDS, NO_SHIFT, Shift
 
 DAY_RULE_VERSION = 1
-"""Version of this rule, which is the suite version of `tabletop-day`: raise it where days differ."""
+"""Version of this rule, and of `tabletop-day`: to be raised if days change."""
 
 TASKS = range(8, 61)
 """Possible numbers of tasks of a day."""

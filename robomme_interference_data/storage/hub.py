@@ -49,6 +49,8 @@ def locate(
                 "Omit the revision, or give namespace/name instead of the folder.",
             )
         return LocalFiles(folder)
+    if folder.is_file():
+        raise MissingFileError(f"{folder} is a file", "Give the folder that it is in.")
     return HubFiles.parse(str(location), repo_type, revision)
 
 

@@ -18,6 +18,7 @@ from support.scoring import BASE, OWN, RELEASED, RETRIEVAL, ROOT
 from robomme_interference_data.errors import FormatError, MissingFileError
 from robomme_interference_data.evaluate.leaderboard.entries import (
     BoardStanding,
+    Entries,
     PublishedRun,
     read_entries,
 )
@@ -106,7 +107,8 @@ def test_videos_are_linked(published_run: Files, hub: HubServer, tmp_path: Path)
     for more, expected in (({}, names), ({"videos/a.mp4": b""}, {**names, "videos": "videos"})):
         commit = hub.push(f"datasets/{REPOSITORY}", files | more)
         location = f"{REPOSITORY}@{commit}"
-        links = Results(PublishedRun(location, "weights", boards.SHA256), location).links
+        run = PublishedRun(location, "weights", boards.SHA256)
+        links = Results(run, Entries(boards=())).links
         page = f"{hub.endpoint}/datasets/{REPOSITORY}"
         assert links == {
             name: f"{page}/{'tree' if name == 'videos' else 'blob'}/{commit}/{path}"

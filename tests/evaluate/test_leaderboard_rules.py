@@ -1,5 +1,6 @@
 """The twelve rules of a leaderboard, each broken once, and ways around them."""
 
+import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -229,9 +230,11 @@ def test_rules_are_twelve() -> None:
         ("someone/nothing@" + "0" * 40, "does not exist"),
         (f"{REPOSITORY}@" + "0" * 40, "no revision"),
         (f"{REPOSITORY}@data-1.0.0", "40 digits"),
+        (REPOSITORY, "there is no folder"),
+        ("results.yaml", "there is no folder"),
     ],
 )
-def test_what_the_hub_does_not_have(
+def test_what_is_not_there(
     location: str, part: str, published_run: Files, hub: HubServer, tmp_path: Path
 ) -> None:
     hub.push(f"datasets/{REPOSITORY}", published_run)
@@ -240,6 +243,14 @@ def test_what_the_hub_does_not_have(
     # What needs no rows is checked at once.
     assert [problem.rule.number for problem in problems] == [9, 10]
     assert part in problems[0].what
+
+
+def test_weights_are_not_empty(published_run: Files, hub: HubServer, tmp_path: Path) -> None:
+    commit = hub.push(f"datasets/{REPOSITORY}", published_run)
+    nothing = hashlib.sha256(b"").hexdigest()
+    entry = boards.submission(f"{REPOSITORY}@{commit}", checkpoint_sha256=nothing)
+    [problem] = check_all(read_entries(boards.write_board(tmp_path / "results.yaml", entry)))
+    assert problem.rule.number == 10
 
 
 @pytest.mark.parametrize("name", ["rollouts.parquet", RATES, "README.md"])

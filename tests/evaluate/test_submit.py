@@ -81,12 +81,13 @@ def test_an_entry_is_not_added_in_the_middle(tmp_path: Path) -> None:
     assert path.read_text() == text
 
 
+OWN_BOARD = "boards:\n- {name: a, simulator: b}\n"
 WRONG_FIELDS = (
     "boards: 3",
     "boards:\n- name: a",
     "boards:\n- name: a\n  simulator: b\n  more: c",
-    "boards: []\nreferences:\n- {board: a, rows: [b], standing: submission}",
-    "boards: []\nother: 1",
+    f"{OWN_BOARD}references:\n- {{board: a, rows: [b], standing: submission}}",
+    f"{OWN_BOARD}other: 1",
 )
 
 
@@ -115,10 +116,11 @@ def test_the_json_schema() -> None:
         "? [a]\n: b",
         pytest.param("[" * 5000, id="deep"),
         "boards:\n- &a {name: a, simulator: b}\n- *a",
-        "boards: []\nreferences:\n- {board: a, rows: [b], standing: control}",
-        "boards:\n- {name: a, simulator: b}\nreferences: [{board: a, rows: [], standing: control}]",
+        "boards: []",
+        f"{OWN_BOARD}references:\n- {{board: c, rows: [d], standing: control}}",
+        f"{OWN_BOARD}references:\n- {{board: a, rows: [], standing: control}}",
         # YAML would keep the second list, and so lose the entries of the first.
-        "boards:\n- {name: a, simulator: b}\nsubmissions: []\nsubmissions: []",
+        f"{OWN_BOARD}submissions: []\nsubmissions: []",
         "boards:\n- {name: a, simulator: b, name: c}",
     ],
 )

@@ -95,7 +95,7 @@ def read_rows(
         if len(bad_reasons) > _SHOWN:
             lines.append(f"… and {len(bad_reasons) - _SHOWN:,} more")
         raise FormatError(
-            "\n".join(lines), f"Correct them, or leave them out with {named('lenient')}."
+            "\n".join(lines), f"Correct them; score leaves them out with {named('lenient')}."
         )
     rows = tuple(checks.sound.values())
     if not rows:

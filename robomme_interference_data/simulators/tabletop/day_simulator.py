@@ -8,12 +8,7 @@ from numpy.typing import NDArray
 
 from robomme_interference_data.constants import MAX_STEPS
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema.days import (
-    DAY_RULE_VERSION,
-    DayPlan,
-    ability_of,
-    goal_in_day,
-)
+from robomme_interference_data.schema.days import DAY_RULE_VERSION, DayPlan, ability_of, goal_in_day
 from robomme_interference_data.schema.rollouts import Status
 from robomme_interference_data.schema.shifts import NO_SHIFT
 from robomme_interference_data.schema.subgoal import Subgoal
