@@ -189,9 +189,7 @@ def test_a_buffer_shows_its_spans(root: Path, condition: str) -> None:
 
 
 @pytest.mark.parametrize("condition", ["day-k2", "day-alone", "no-history"])
-def test_the_picture_of_a_day_names_the_ability(
-    root: Path, tmp_path: Path, condition: str
-) -> None:
+def test_the_picture_of_a_day_names_the_ability(root: Path, tmp_path: Path, condition: str) -> None:
     """Also where nothing is shown."""
     pytest.importorskip("matplotlib")
     out = tmp_path / "strip.svg"
