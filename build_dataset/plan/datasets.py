@@ -44,6 +44,8 @@ def plan_dataset(
     if kind in UNITS:
         _check_split_of_units(config)
         split = "train"
+    if kind == DAYS:
+        _check_days(config.source)
     sources = open_sources(kind, config, unit)
     episodes = choose_episodes(
         sources,
@@ -73,6 +75,17 @@ def plan_dataset(
         fps=config.fps,
         resize=None if config.resize is None else Resize.parse(config.resize),
     )
+
+
+def _check_days(sources: Sequence[str]) -> None:
+    """Check that sources record days, and not single episodes."""
+    for text in sources:
+        if not takes(text, "kind"):
+            raise InvalidOptionError(
+                f"the source {text} has no days",
+                f"Use tabletop-day, or choose other {named('conditions')}.",
+                option="source",
+            )
 
 
 def _check_split_of_units(config: BuildConfig) -> None:

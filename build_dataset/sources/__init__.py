@@ -52,7 +52,7 @@ SOURCES = Registry(
         "tabletop-day": SpecKind(
             "tabletop-day[:TASKS]",
             f"{__name__}.day:DaySource",
-            "(?P<tasks>[0-9]{1,9})",
+            "(?P<tasks>[1-9][0-9]{0,8})",
             default=str(DEFAULT_TASKS),
             arguments={"name": "tabletop-day"},
         ),

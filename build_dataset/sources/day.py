@@ -6,14 +6,9 @@ from dataclasses import replace
 from typing import Any, override
 
 from robomme_interference_data.constants import DAYS, EXECUTIONS, UNITS
+from robomme_interference_data.errors import InvalidOptionError
 from robomme_interference_data.ids import EpisodeId
-from robomme_interference_data.schema.days import (
-    ability_of,
-    day_id,
-    day_tasks,
-    plan_day,
-    queries_of,
-)
+from robomme_interference_data.schema.days import TASKS, ability_of, day_id, plan_day, queries_of
 from robomme_interference_data.schema.records import Day
 
 from .base import Frame, Recording, SourceEpisode
@@ -41,7 +36,10 @@ class DaySource(SimulatorSource):
     def __init__(self, name: str, kind: str, tasks: str, every: int = 1, shifted: bool = False):
         super().__init__(name, every, shifted)
         self._kind, self._tasks = kind, int(tasks)
-        day_tasks(day_id(self._tasks, "test", 0))  # raises
+        if self._tasks not in TASKS:
+            raise InvalidOptionError.expected(
+                "source", f"{name}:{tasks}", f"{TASKS[0]} to {TASKS[-1]} tasks, such as {name}:30"
+            )
         if kind == DAYS:
             self.time_limit_s *= self._tasks
 

@@ -207,7 +207,7 @@ def only_in_days(query: EpisodeId) -> BuildError:
     """
     return BuildError(
         f"{query} is a query of a day, which decides on its lessons",
-        f"Choose {named('conditions')} of days alone: no-history,day-alone,day-k0,day-k3",
+        f"Choose {named('conditions')} of days alone: no-history,day-alone,day-k0,day-k2",
     )
 
 

@@ -149,7 +149,8 @@ def strip_png(buffer: "Buffer") -> bytes:
 def _draw_head(page: Page, buffer: "Buffer", camera: str) -> float:
     """Write the title and return the y below it."""
     manifest = buffer.manifest
-    title = f"{buffer.episode_id}   {buffer.condition}"
+    ability = buffer.query.record.ability
+    title = "   ".join(filter(None, (str(buffer.episode_id), buffer.condition, ability)))
     page.text(_MARGIN, 0.06, title, _TITLE, width=0.63 * _INNER, align="left", bold=True)
     simulator = manifest.simulator and f"simulator {manifest.simulator}"
     facts = ", ".join(filter(None, (f"{camera} camera", simulator, manifest.difficulty)))
@@ -165,7 +166,8 @@ def _draw_head(page: Page, buffer: "Buffer", camera: str) -> float:
     parts = " + ".join(f"{count} {role}" for role, count in frames.items())
     counts = f"{len(buffer)} history frames" + (f" = {parts}" if parts else "")
     share = f"an even {SAMPLE_FRAMES}-frame sample holds {manifest.lesson_share:.0%} lesson"
-    page.text(_MARGIN, y + 0.03, f"{counts};  {share}", _TEXT, align="left", color=_GRAY)
+    text = f"{counts};  {share}"
+    page.text(_MARGIN, y + 0.03, text, _TEXT, width=_INNER, align="left", color=_GRAY)
     return y + 0.17
 
 
@@ -252,7 +254,8 @@ def _draw_timeline(page: Page, buffer: "Buffer", top: float) -> None:
             x = _MARGIN + (session.start + session.stop) / 2 * scale
             page.text(x, bar - 0.22, inside, _NUMBER, bold=True)
     end = _MARGIN + width
-    page.box(end - scale, bar, scale, _BAR, fill="black", edge="black", line=0.8)
+    wide = min(scale, _MARK)  # also next to an empty history
+    page.box(end - wide, bar, wide, _BAR, fill="black", edge="black", line=0.8)
     page.text(end + 0.02, bar - 0.21, "+1 live", _NUMBER, align="left", color=_GRAY)
     page.arrow(end + 0.05, end + 0.37, bar + _BAR / 2)
     for index in range(0, len(buffer) + 1, round_step(len(buffer), 10)):

@@ -37,6 +37,7 @@ from robomme_interference_data.evaluate.run.config import CeilingConfig
 from robomme_interference_data.progress import WorkProgress
 from robomme_interference_data.runtime.executor import Serial
 from robomme_interference_data.schema.records import DaySpan
+from robomme_interference_data.viz.filmstrip import draw_strip
 
 RECORDS = "days/meta/interference.parquet"
 UPDATE, PIECES, ABSENT = "VideoUnmask/test/1", "RouteStick/test/6", "VideoPlaceOrder/test/1"
@@ -187,6 +188,15 @@ def test_a_buffer_shows_its_spans(root: Path, condition: str) -> None:
     assert buffer.manifest.lesson_frames == 6
 
 
+@pytest.mark.parametrize("condition", ["day-k2", "day-alone", "no-history"])
+def test_the_picture_of_a_day_names_the_ability(root: Path, tmp_path: Path, condition: str) -> None:
+    """Also where nothing is shown."""
+    pytest.importorskip("matplotlib")
+    out = tmp_path / "strip.svg"
+    draw_strip(load_buffer(ABSENT, condition, buffer_set=root), out)
+    assert f"{ABSENT}   {condition}   absent" in out.read_text(encoding="utf-8")
+
+
 def test_abilities_have_ceilings(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Its lessons show other parts than the scenes of the simulator whose name it has.
     monkeypatch.setattr("robomme_interference_data.evaluate.ceiling.recorded_scene", lambda _: None)
@@ -284,9 +294,23 @@ def test_days_that_lack_a_query(own: Path) -> None:
         plan_again(own, CONDITIONS)
 
 
-def test_no_such_number_of_tasks(tmp_path: Path, run: Any) -> None:
-    code, _, err = run("build", tmp_path / "buffers", "--source", "tabletop-day:7")
-    assert code == 1 and "8 to 60" in err
+@pytest.mark.parametrize("tasks", ["7", "61", "08", "abc"])
+def test_no_such_number_of_tasks(tasks: str, tmp_path: Path, run: Any) -> None:
+    code, _, err = run("build", tmp_path / "buffers", "--source", f"tabletop-day:{tasks}")
+    assert code == 1 and f"tabletop-day:{tasks}" in err
+    assert ("8 to 60" in err) == (tasks in ("7", "61"))
+
+
+@pytest.mark.parametrize(
+    "options", [("--conditions", "no-history,day-k0"), ("--only", "days"), ("--with", "days")]
+)
+def test_a_source_without_days_before_anything_is_built(
+    options: tuple[str, ...], tmp_path: Path, run: Any
+) -> None:
+    out = tmp_path / "buffers"
+    code, _, err = run("build", out, "--source", "tabletop", "--split", "test", *options)
+    assert code == 1 and "tabletop has no days" in err
+    assert not out.exists()
 
 
 # --- verify -------------------------------------------------------------------------------------
