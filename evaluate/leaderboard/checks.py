@@ -248,10 +248,14 @@ def _other_rates(results: Results, stated: str) -> Iterator[str]:
         yield f"the rows cannot be scored: {error.message}"
         return
     names = ("simulator", "system", "condition", "n", "successes", "rate")
-    ours, theirs = (
-        {tuple(map(row.get, names)) for row in csv.DictReader(text.splitlines())}
-        for text in (scored.tables["main"].csv(), stated)
-    )
+    try:
+        ours, theirs = (
+            {tuple(map(row.get, names)) for row in csv.DictReader(text.splitlines())}
+            for text in (scored.tables["main"].csv(), stated)
+        )
+    except csv.Error as error:
+        yield f"{RATES} cannot be read: {error}"
+        return
     differing = {cell[1:3] for cell in ours ^ theirs if cell[3] != "0"}
     for system, condition in sorted(differing, key=str)[:_SHOWN]:
         yield f"{RATES} has another rate of {system} under {condition} than its rows"

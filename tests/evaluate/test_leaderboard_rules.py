@@ -254,7 +254,7 @@ def test_weights_are_not_empty(published_run: Files, hub: HubServer, tmp_path: P
 
 
 @pytest.mark.parametrize("name", ["rollouts.parquet", RATES, "README.md"])
-@pytest.mark.parametrize("data", [b"", b"nothing of it", b"\xff\x00,"])
+@pytest.mark.parametrize("data", [b"", b"nothing of it", b"\xff\x00,", b"a" * 200_000])
 def test_damaged_files_of_a_repository(
     name: str, data: bytes, published_run: Files, hub: HubServer, tmp_path: Path
 ) -> None:
