@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from robomme_interference_data.constants import FORMAT_VERSION, OFFICIAL
-from robomme_interference_data.errors import FormatError, InterferenceError, first_line
+from robomme_interference_data.errors import FormatError, InterferenceError
 from robomme_interference_data.evaluate.score.rows.reading import read_rows
 from robomme_interference_data.evaluate.score.rows.values import Row
 from robomme_interference_data.storage.files import all_files, write_json, write_text
@@ -102,9 +102,9 @@ def write_site(made: Leaderboard, out: Path) -> dict[str, Any]:
         for path in written:
             (out / path).parent.mkdir(exist_ok=True)
             (folder / path).replace(out / path)
-    for path in all_files(out / "rows"):
-        if f"rows/{path}" not in written:  # of a board that is gone
-            (out / "rows" / path).unlink()
+    for path in (out / "rows").glob("*.csv"):
+        if f"rows/{path.name}" not in written and _is_rows_table(path):  # of a board that is gone
+            path.unlink()
     return data
 
 
@@ -152,7 +152,7 @@ def _contradiction(rows: Sequence[BoardRows]) -> str:
     try:
         read_rows(settings.rows, settings.system)
     except InterferenceError as error:
-        return first_line(error)
+        return " ".join(error.message.splitlines())  # the first line only counts the bad rows
     return ""
 
 
@@ -197,6 +197,12 @@ def _rows_table(board: Standings) -> Table:
     rows.sort(key=_order)
     values = [tuple(getattr(row, name) for name in _COLUMNS) for row in rows]
     return Table("rows", board.board.name, _COLUMNS, values)
+
+
+def _is_rows_table(path: Path) -> bool:
+    """Return whether a file has the columns of `rows/`: others are not of a leaderboard."""
+    with path.open(encoding="utf-8", errors="replace") as file:
+        return file.readline().rstrip("\n") == ",".join(_COLUMNS)
 
 
 def _order(row: Row) -> tuple[Any, ...]:

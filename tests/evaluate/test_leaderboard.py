@@ -148,11 +148,16 @@ def test_rows_lie_beside_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_an_interrupted_site_lacks_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each file is replaced by its new version; rows of boards that are gone are deleted last."""
+    """Each file is replaced by its new version; rows of boards that are gone are deleted last.
+
+    Other files stay.
+    """
     made = boards.made_up(tmp_path)
     out = tmp_path / "site"
     write_site(made, out)
-    (out / "rows" / "gone.csv").write_text("rows of a board that is gone\n")
+    rows = (out / "rows" / f"{BOARD}.csv").read_text(encoding="utf-8")
+    (out / "rows" / "gone.csv").write_text(rows, encoding="utf-8")
+    (out / "rows" / "mine.csv").write_text("my own rows\n")
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
 
     replace_file = Path.replace
@@ -167,7 +172,7 @@ def test_an_interrupted_site_lacks_no_file(tmp_path: Path, monkeypatch: pytest.M
         write_site(made, out)
     assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     write_site(made, out)
-    assert sorted(path.name for path in out.rglob("*.csv")) == [f"{BOARD}.csv"]
+    assert sorted(path.name for path in out.rglob("*.csv")) == ["mine.csv", f"{BOARD}.csv"]
 
 
 def test_boards_do_not_mix_simulators(board_runs: Path, tmp_path: Path) -> None:
