@@ -210,11 +210,11 @@ def _parse(text: str, path: Path) -> Entries:
         raise FormatError.damaged(path, f"no valid YAML: {error}") from None
     if not isinstance(content, Mapping):
         raise FormatError.damaged(path, "expected boards, references and submissions")
-    content = {"references": (), "submissions": (), **content}
+    content = dict(content)
     parts: dict[str, Any] = {}
     for name, record in _LISTS.items():
         listed = content.pop(name, None) or []
-        if not isinstance(listed, list | tuple):
+        if not isinstance(listed, list):
             raise FormatError.damaged(path, f"{name}: expected a list")
         parts[name] = tuple(
             from_dict(record, each, f"{path}, {name}, number {number}", strict=True)

@@ -147,6 +147,19 @@ def test_rows_lie_beside_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         make_leaderboard(read_entries(path))
 
 
+def test_boards_may_be_called_as_parts_of_the_page(tmp_path: Path) -> None:
+    """The script looks parts up by their ids."""
+    made = boards.made_up(tmp_path)
+    [board] = made.boards
+    for name in ("outcomes", "about"):
+        board.board = replace(board.board, name=name)
+        write_site(made, tmp_path / name)
+        page = (tmp_path / name / "index.html").read_text(encoding="utf-8")
+        ids = re.findall(r' id="([^"]*)"', page)
+        assert len(ids) == len({*ids})
+        assert {*re.findall(r'href="#([^"]*)"', page)} <= {*ids}
+
+
 def test_an_interrupted_site_lacks_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each file is replaced by its new version; rows of boards that are gone are deleted last.
 
