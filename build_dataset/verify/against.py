@@ -1,6 +1,6 @@
 """Compare the plan of a buffer set with a reference plan. Pure rules."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -22,8 +22,8 @@ class PlanComparison:
 
     Attributes:
         differences: What must be equal, and is not.
-        notes: What may differ, and does: images of another renderer, and what the buffer set has
-            beyond the plan.
+        notes: What may differ, and does: images of another renderer, features of the plan that
+            the buffer set lacks, and what it has beyond the plan.
         digests: Number of episodes whose digests were compared.
     """
 
@@ -37,7 +37,7 @@ def compare(found: ReferencePlan, plan: ReferencePlan) -> PlanComparison:
 
     The buffers of the plan must be there with the same sessions, and the pool must be the same.
     Digests of states must be equal, those of images where the renderer is the same. Further
-    queries, conditions and cameras are no difference.
+    queries, conditions and cameras are no difference; nor are fewer cameras, which are noted.
     """
     digests = [*_compared(found, plan)]
     differences = [
@@ -46,7 +46,11 @@ def compare(found: ReferencePlan, plan: ReferencePlan) -> PlanComparison:
         *_buffers(found, plan),
         *_digests(digests, found, plan),
     ]
-    notes = [*_further(found, plan), *_other_images(digests, found, plan)]
+    notes = [
+        *_further(found, plan),
+        *_lacking(found, plan),
+        *_other_images(digests, found, plan),
+    ]
     return PlanComparison(tuple(differences), tuple(notes), len(digests))
 
 
@@ -170,6 +174,20 @@ def _further(found: ReferencePlan, plan: ReferencePlan) -> Iterator[str]:
         yield f"Beyond the plan: the queries {_listed(queries)}"
     if conditions := [name for name in found.conditions if name not in plan.conditions]:
         yield f"Beyond the plan: the conditions {', '.join(conditions)}"
+
+
+def _lacking(found: ReferencePlan, plan: ReferencePlan) -> Iterator[str]:
+    """Yield features with digests in the plan that the buffer set has none of: no such camera."""
+    here, there = _by_dataset(found), _by_dataset(plan)
+    for name in there:
+        features = Counter[str]()
+        for episode in here[name].keys() & there[name].keys():
+            features.update(there[name][episode].digests.keys() - here[name][episode].digests.keys())
+        for feature, count in sorted(features.items()):
+            yield (
+                f"Not compared: {feature} of {counted(count, 'episode')} of the {name}, which the "
+                "buffer set lacks"
+            )
 
 
 def _by_dataset(plan: ReferencePlan) -> defaultdict[str, dict[EpisodeId, ReferenceEpisode]]:

@@ -228,6 +228,24 @@ def test_images_of_another_renderer_are_noted_only(plan: ReferencePlan) -> None:
     assert compare(plan, replace(plan, episodes=tuple(without))) == PlanComparison((), (), 0)
 
 
+def test_a_camera_that_is_lacking_is_noted(plan: ReferencePlan) -> None:
+    """Else a buffer set without images would equal a plan with their digests."""
+    feature = "observation.images.front"
+    episodes = [
+        replace(
+            episode,
+            digests={name: episode.digests[name] for name in episode.digests if name != feature},
+        )
+        for episode in plan.episodes
+    ]
+    comparison = compare(replace(plan, episodes=tuple(episodes)), plan)
+    assert not comparison.differences
+    assert [note.split(", which")[0] for note in comparison.notes] == [
+        f"Not compared: {feature} of 3 episodes of the demonstrations",
+        f"Not compared: {feature} of {len(plan.episodes) - 3} episodes of the distractors",
+    ]
+
+
 def test_more_than_the_plan_is_no_difference(plan: ReferencePlan) -> None:
     fewer = replace(plan, conditions=("k0", "k1"), queries=plan.queries[1:])
     comparison = compare(plan, fewer)
