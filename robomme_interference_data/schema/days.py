@@ -9,8 +9,9 @@ Rule version 1, for day d of n tasks:
 1. *Queries.* With m = n // 15, at least 1, the episodes d·m to d·m + m − 1 of every family are
    candidates, family by family beginning with family d. They are taken while their lessons fit into
    three quarters of the first n − n // 4 tasks.
-2. *Abilities.* What a query asks for depends on its id alone (see `ability_of`). In every family
-   and difficulty all abilities occur equally often, so that no first view tells which one it is.
+2. *Abilities.* What a query asks for depends on its id alone (see `ability_of`). In all
+   difficulties of a family an ability has the same share, so that no first view tells which one it
+   is.
 3. *Order.* The lessons are put at random places of the first n − n // 4 tasks; several lessons of a
    query are in the order that its ability needs. Other tasks fill the rest, so that every query can
    be asked after up to n // 4 further tasks. Every fifth of them is idle time. A query without a
