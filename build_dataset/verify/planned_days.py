@@ -69,12 +69,17 @@ def _days(days: Dataset) -> Iterator[Violation]:
 
 
 def _planner(source: Mapping[str, Any]) -> Any:
-    """Return the class of the simulator that a source is; None if it is of another version."""
+    """Return the class of the simulator that a source is; None if it is of another version.
+
+    The official simulator, which has no version of its own, plays no days.
+    """
     name = str(source.get("kind"))
     # Never one that only the data names: it may be any module.
     if name not in SIMULATORS:
         return None
     simulator = simulator_class(name)
+    if simulator.suite_version is None:
+        return None
     recorded = suite_version(name, source)
     return simulator if recorded == str(simulator.suite_version) else None
 

@@ -397,9 +397,12 @@ def test_another_ability_is_found(own: Path) -> None:
     expect(own, f"demonstrations {ABSENT}: ability is recall; the plan gives absent")
 
 
-def test_days_of_another_version_are_not_planned_again(own: Path) -> None:
+@pytest.mark.parametrize(("name", "version"), [("tabletop-day", "0"), ("robomme", "None")])
+def test_days_of_another_version_are_not_planned_again(name: str, version: str, own: Path) -> None:
+    """Nor those that claim to be of a simulator that plays none."""
     path = own / "days/meta/interference.json"
-    path.write_text(path.read_text().replace('"tabletop-day": "1"', '"tabletop-day": "0"'))
+    text = path.read_text().replace('"tabletop-day": "1"', f'"{name}": "{version}"')
+    path.write_text(text.replace('"tabletop-day"', f'"{name}"'))
     expect(own, "days/meta/interference.json: .*; days of these cannot be planned here")
 
 
