@@ -143,7 +143,9 @@ def _rows(path: Path) -> list[Rollout]:
     rows = []
     for number, line in enumerate(whole_lines(path).splitlines(), 1):
         try:
-            rows.append(row_of(line))
+            row = row_of(line)
+            _ = row.episode_id  # raises, if it is none
+            rows.append(row)
         except ValueError as error:
             reason = first_line(error)
             raise FormatError(f"{path.name}, line {number} is no row: {reason}") from None

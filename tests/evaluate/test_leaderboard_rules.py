@@ -13,7 +13,7 @@ from support.boards import BOARD, Files
 from support.buffer_sets import GOLDEN
 from support.hub_server import HubServer
 
-from robomme_interference_data.constants import RUN_HEADER
+from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD
 from robomme_interference_data.evaluate.leaderboard.checks import few_errors
 from robomme_interference_data.evaluate.leaderboard.entries import read_entries
 from robomme_interference_data.evaluate.leaderboard.published import RATES
@@ -263,6 +263,20 @@ def test_damaged_files_of_a_repository(
     entry = boards.submission(f"{REPOSITORY}@{commit}")
     problems = check_all(read_entries(boards.write_board(tmp_path / "results.yaml", entry)))
     assert {problem.rule.number for problem in problems} == {11}
+
+
+@pytest.mark.parametrize("change", [{"family": "<b>"}, {"split": "all"}, {"episode": -1}])
+def test_rows_of_no_episode(
+    change: dict[str, Any], published_run: Files, hub: HubServer, tmp_path: Path
+) -> None:
+    """They do not stop the board, and the submission is named."""
+    *lines, last = published_run[RUN_RECORD].decode().splitlines()
+    lines.append(json.dumps(json.loads(last) | change))
+    files = published_run | {RUN_RECORD: "\n".join(lines).encode() + b"\n"}
+    commit = hub.push(f"datasets/{REPOSITORY}", files)
+    entry = boards.submission(f"{REPOSITORY}@{commit}")
+    [problem] = check_all(read_entries(boards.write_board(tmp_path / "results.yaml", entry)))
+    assert problem.rule.number == 9 and f"line {len(lines)} is no row" in problem.what
 
 
 def test_names_are_unique_on_a_board(
