@@ -46,11 +46,7 @@ def compare(found: ReferencePlan, plan: ReferencePlan) -> PlanComparison:
         *_buffers(found, plan),
         *_digests(digests, found, plan),
     ]
-    notes = [
-        *_further(found, plan),
-        *_lacking(found, plan),
-        *_other_images(digests, found, plan),
-    ]
+    notes = [*_further(found, plan), *_lacking(found, plan), *_other_images(digests, found, plan)]
     return PlanComparison(tuple(differences), tuple(notes), len(digests))
 
 
@@ -182,7 +178,8 @@ def _lacking(found: ReferencePlan, plan: ReferencePlan) -> Iterator[str]:
     for name in there:
         features = Counter[str]()
         for episode in here[name].keys() & there[name].keys():
-            features.update(there[name][episode].digests.keys() - here[name][episode].digests.keys())
+            digests, planned = here[name][episode].digests, there[name][episode].digests
+            features.update(planned.keys() - digests.keys())
         for feature, count in sorted(features.items()):
             yield (
                 f"Not compared: {feature} of {counted(count, 'episode')} of the {name}, which the "
