@@ -15,6 +15,7 @@ from robomme_interference_data.evaluate.score.config import Expected, Settings
 from robomme_interference_data.evaluate.score.scoring import score
 from robomme_interference_data.evaluate.systems import SYSTEMS
 from robomme_interference_data.schema.codec import arrow_schema, to_table
+from robomme_interference_data.schema.conditions import NO_HISTORY
 from robomme_interference_data.schema.rollouts import KEY_COLUMNS, Status
 from robomme_interference_data.schema.shifts import NO_SHIFT
 from robomme_interference_data.storage.files import sha256_file
@@ -73,9 +74,12 @@ def complete_cells(case: Case) -> Iterator[str]:
     ran = {(row.condition, _repeat(row), row.episode_id) for row in case.rows}
     repeats = sorted({_repeat(row) for row in case.rows}, key=str)
     facts = case.rows[0] if case.rows else None
+    conditions = {row.condition for row in case.rows}
     for condition in case.grid.conditions:
         applies = facts is None or facts.applies(condition)
-        if not applies and not any(row.condition == condition for row in case.rows):
+        # Who has rows with a history has them under all conditions, whatever the rows state.
+        applies |= condition != NO_HISTORY and bool(conditions - {NO_HISTORY})
+        if not applies and condition not in conditions:
             continue
         episodes = case.grid.episodes(condition)
         for repeat in repeats:

@@ -93,6 +93,14 @@ def unread_and_incomplete(files: Files, folder: Path) -> Broken:
     return boards.changed(files, folder, row=other), {"memory": "none"}
 
 
+def unread_under_k7_alone(files: Files, folder: Path) -> Broken:
+    def other(row: dict[str, Any]) -> dict[str, Any]:
+        kept = row["condition"] in ("no-history", "k7")
+        return row | {"reads_history": False, "memory": None} if kept else {}
+
+    return boards.changed(files, folder, row=other), {"memory": "none"}
+
+
 def invented(files: Files) -> bytes:
     """A line of the stated rates under a condition that no row has."""
     lines = files[RATES].decode().splitlines()
@@ -108,6 +116,7 @@ def edited_probe(files: Files, **values: Any) -> Files:
 
 AROUND: list[tuple[int, Callable[[Files, Path], Broken]]] = [
     (3, unread_and_incomplete),
+    (3, unread_under_k7_alone),
     (9, lambda files, _: (edited_probe(files, verdict="nondeterministic"), {})),
     (9, lambda files, _: (edited_probe(files, verdict="fine"), {})),
     (11, lambda files, _: (files | {RATES: files[RATES] + invented(files)}, {})),
