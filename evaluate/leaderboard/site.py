@@ -102,9 +102,9 @@ def write_site(made: Leaderboard, out: Path) -> dict[str, Any]:
         for path in written:
             (out / path).parent.mkdir(exist_ok=True)
             (folder / path).replace(out / path)
-    for path in (out / "rows").glob("*.csv"):
-        if f"rows/{path.name}" not in written and _is_rows_table(path):  # of a board that is gone
-            path.unlink()
+    for table in (out / "rows").glob("*.csv"):
+        if f"rows/{table.name}" not in written and _is_rows_table(table):  # of a board that is gone
+            table.unlink()
     return data
 
 
