@@ -145,21 +145,21 @@ class Entries:
     def locate(self, location: str) -> str | Path:
         """Return a location as it is opened.
 
-        A repository's names its commit, `namespace/name@COMMIT`; any other is a folder, relative to
-        that of the file.
+        It is a folder, relative to that of the file, or a repository at its commit,
+        `namespace/name@COMMIT`.
 
         Raises:
             MissingFileError: There is no such folder.
         """
+        folder = self.folder / location
+        if folder.is_dir():
+            return folder
         if "@" in location:
             return location
-        folder = self.folder / location
-        if not folder.is_dir():
-            raise MissingFileError(
-                f"there is no folder {folder}",
-                f"Give a folder relative to {self.folder}, or namespace/name@COMMIT.",
-            )
-        return folder
+        raise MissingFileError(
+            f"there is no folder {folder}",
+            f"Give a folder relative to {self.folder}, or namespace/name@COMMIT.",
+        )
 
 
 def _check(name: str, value: str, known: Any) -> None:

@@ -147,6 +147,13 @@ def test_rows_lie_beside_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         make_leaderboard(read_entries(path))
 
 
+def test_a_folder_with_an_at_sign_lies_beside_the_file(tmp_path: Path) -> None:
+    (tmp_path / "results@2026").mkdir()
+    entries = Entries(boards=(), folder=tmp_path)
+    assert entries.locate("results@2026") == tmp_path / "results@2026"
+    assert entries.locate("someone/results@2026") == "someone/results@2026"
+
+
 def test_boards_may_be_called_as_parts_of_the_page(tmp_path: Path) -> None:
     """The script looks parts up by their ids."""
     made = boards.made_up(tmp_path)
