@@ -4,7 +4,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
-from robomme_interference_data.constants import CAMERA_PREFIX, UNITS
+from robomme_interference_data.constants import UNITS
 from robomme_interference_data.errors import counted
 from robomme_interference_data.ids import EpisodeId, format_numbers
 from robomme_interference_data.schema.reference_plan import (
@@ -22,8 +22,8 @@ class PlanComparison:
 
     Attributes:
         differences: What must be equal, and is not.
-        notes: What may differ, and does: images of another renderer, features of the plan that
-            the buffer set lacks, and what it has beyond the plan.
+        notes: What may differ, and does: images and states of another renderer, features of the
+            plan that the buffer set lacks, and what it has beyond the plan.
         digests: Number of episodes whose digests were compared.
     """
 
@@ -36,8 +36,8 @@ def compare(found: ReferencePlan, plan: ReferencePlan) -> PlanComparison:
     """Compare the plan of a buffer set with a reference plan; no order of either has an effect.
 
     The buffers of the plan must be there with the same sessions, and the pool must be the same.
-    Digests of states must be equal, those of images where the renderer is the same. Further
-    queries, conditions and cameras are no difference; nor are fewer cameras, which are noted.
+    Digests must be equal where the renderer is the same. Further queries, conditions and cameras
+    are no difference; nor are fewer cameras, which are noted.
     """
     digests = [*_compared(found, plan)]
     differences = [
@@ -46,7 +46,7 @@ def compare(found: ReferencePlan, plan: ReferencePlan) -> PlanComparison:
         *_buffers(found, plan),
         *_digests(digests, found, plan),
     ]
-    notes = [*_further(found, plan), *_lacking(found, plan), *_other_images(digests, found, plan)]
+    notes = [*_further(found, plan), *_lacking(found, plan), *_other_renderer(digests, found, plan)]
     return PlanComparison(tuple(differences), tuple(notes), len(digests))
 
 
@@ -113,8 +113,7 @@ class _Digests:
 
     dataset: str
     episode: EpisodeId
-    images: tuple[str, ...]
-    others: tuple[str, ...]
+    differing: tuple[str, ...]
 
 
 def _compared(found: ReferencePlan, plan: ReferencePlan) -> Iterator[_Digests]:
@@ -123,10 +122,8 @@ def _compared(found: ReferencePlan, plan: ReferencePlan) -> Iterator[_Digests]:
         for episode in sorted(here[name].keys() & there[name].keys()):
             digests, planned = here[name][episode].digests, there[name][episode].digests
             if features := sorted(digests.keys() & planned.keys()):
-                differing = [f for f in features if digests[f] != planned[f]]
-                images = [f for f in differing if f.startswith(CAMERA_PREFIX)]
-                others = [f for f in differing if f not in images]
-                yield _Digests(name, episode, tuple(images), tuple(others))
+                differing = tuple(f for f in features if digests[f] != planned[f])
+                yield _Digests(name, episode, differing)
 
 
 def _digests(
@@ -134,28 +131,28 @@ def _digests(
 ) -> Iterator[Violation]:
     """Yield episodes that differ although their renderer does not explain it."""
     for digests in compared:
-        where = f"{digests.dataset} {digests.episode}"
-        if digests.others:
-            yield Violation(where, f"{', '.join(digests.others)} differs from the plan")
-        if digests.images and _same_renderer(digests.dataset, found, plan):
-            what = f"{', '.join(digests.images)} differs from the plan, though the renderer is the"
-            yield Violation(where, f"{what} same")
+        if digests.differing and _same_renderer(digests.dataset, found, plan):
+            features = ", ".join(digests.differing)
+            what = f"{features} differs from the plan, though the renderer is the same"
+            yield Violation(f"{digests.dataset} {digests.episode}", what)
 
 
-def _other_images(
+def _other_renderer(
     compared: Iterable[_Digests], found: ReferencePlan, plan: ReferencePlan
 ) -> Iterator[str]:
-    """Yield how many episodes of a dataset have other images because another renderer drew them."""
+    """Yield how many episodes of a dataset differ because another renderer drew them."""
     by_dataset = defaultdict[str, list[_Digests]](list)
     for digests in compared:
         by_dataset[digests.dataset].append(digests)
     for name, episodes in by_dataset.items():
-        differing = [episode for episode in episodes if episode.images]
+        differing = [episode for episode in episodes if episode.differing]
         if differing and not _same_renderer(name, found, plan):
             here, there = (drawn.renderers.get(name) or "unknown" for drawn in (found, plan))
+            features = sorted({feature for episode in differing for feature in episode.differing})
             yield (
-                f"Images of {len(differing)} of {counted(len(episodes), 'compared episode')} of "
-                f"the {name} differ, as the renderers do: {here}; in the plan {there}"
+                f"{', '.join(features)} of {len(differing)} of "
+                f"{counted(len(episodes), 'compared episode')} of the {name} differ, as the "
+                f"renderers do: {here}; in the plan {there}"
             )
 
 

@@ -61,14 +61,16 @@ class PlayedDataset:
         source: The simulator.
         cameras: The cameras that it stores.
         unit: Size of its units, as in the distractors.
-        frames: Whether images must be equal too: the simulator has the recorded versions and
-            renderer, and the images were not changed by a build.
+        states: Whether states and actions must be equal too: the simulator has the recorded
+            versions and renderer.
+        frames: Whether images must be, too: in addition, they were not changed by a build.
     """
 
     name: str
     source: Source
     cameras: tuple[str, ...]
     unit: Unit
+    states: bool
     frames: bool
 
 
@@ -114,6 +116,11 @@ class Replay:
     datasets: Mapping[str, PlayedDataset]
     episodes: Sequence[tuple[str, EpisodeRecord]]
     violations: Sequence[Violation]
+
+    @property
+    def without_states(self) -> list[str]:
+        """Names of the datasets whose states and actions are not compared."""
+        return [dataset.name for dataset in self.datasets.values() if not dataset.states]
 
     @property
     def without_frames(self) -> list[str]:
@@ -189,8 +196,9 @@ def plan_replay(
             what = f"sources are {stored}; {simulator} is {source.provenance} here"
             violations.append(Violation(f"{name}/{IDENTITY_PATH}", what))
             continue
-        alike = stored == [source.provenance] and dataset.identity.exact
-        played[name] = PlayedDataset(name, source, dataset.cameras, unit, alike)
+        states = stored == [source.provenance]
+        frames = states and dataset.identity.exact
+        played[name] = PlayedDataset(name, source, dataset.cameras, unit, states, frames)
     if not recorded:
         others = sorted(set().union(*kinds.values()))
         raise InvalidOptionError(
@@ -247,7 +255,7 @@ def _differences(dataset: PlayedDataset, record: EpisodeRecord) -> Iterator[str]
         return
     played = session.current()
     for feature in sorted(played.keys() | record.feature_sha256.keys()):
-        if feature.startswith(CAMERA_PREFIX) and not dataset.frames:
+        if not (dataset.frames if feature.startswith(CAMERA_PREFIX) else dataset.states):
             continue
         if played.get(feature) != record.feature_sha256.get(feature):
             yield f"{feature} is not what is seen when it is played again"

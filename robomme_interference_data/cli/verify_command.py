@@ -201,6 +201,7 @@ class _PlayedAgain:
         with WorkProgress(unit="episodes") as progress:
             found = [*plan.run(executor, progress)]
         report["played_again"] = len(plan.episodes)
+        report["states_not_compared"] = plan.without_states
         report["images_not_compared"] = plan.without_frames
         return found
 
@@ -280,6 +281,11 @@ def _print_extent(report: dict[str, Any]) -> None:
     """Print what was played again, and what could not be checked."""
     if "played_again" in report:
         print_status(f"Played again: {counted(report['played_again'], 'episode')}.")
+    if names := report.get("states_not_compared"):
+        print_status(
+            f"States not compared: {', '.join(names)} were recorded with other versions or another "
+            "renderer than those here."
+        )
     if names := report.get("images_not_compared"):
         print_status(
             f"Images not compared: {', '.join(names)} were recorded with other versions or another "

@@ -7,6 +7,7 @@ Vulkan itself names the driver, which SAPIEN does not show.
 
 import ctypes
 import os
+import platform
 import re
 import subprocess
 import sys
@@ -45,6 +46,9 @@ def renderer_in(python: str) -> str | None:
 def describe_renderer() -> str:
     """Return the renderer, such as `NVIDIA H200, driver NVIDIA 570.86, GPU`.
 
+    One that draws in software is also named by the maker of its processor: those of Intel and AMD
+    approximate reciprocals (the instruction RCPPS, which PhysX uses) by other bits.
+
     Raises:
         LookupError: No device can draw.
     """
@@ -56,7 +60,17 @@ def describe_renderer() -> str:
     if name not in drivers:
         return name
     kind, driver = drivers[name]
-    return f"{name}, driver {driver}, {'CPU' if kind == _CPU else 'GPU'}"
+    return f"{name}, driver {driver}, {f'CPU {_processor()}' if kind == _CPU else 'GPU'}"
+
+
+def _processor() -> str:
+    """Return the maker of the processor, such as `GenuineIntel`, or its architecture."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            found = re.search(r"^vendor_id\s*: (.+)$", file.read(), re.MULTILINE)
+    except OSError:
+        found = None
+    return found[1] if found else platform.machine()
 
 
 def _selected(summary: str, drivers: dict[str, tuple[int, str]]) -> str:

@@ -9,11 +9,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.buffer_sets import GOLDEN, plan_again
-from support.make_plans import planned, recorded_lessons
+from support.make_plans import planned
 from support.messages import raises
 
 from robomme_interference_data import load_buffer_set
@@ -25,10 +26,11 @@ from robomme_interference_data.build_dataset.verify.reference import (
     reference_plan,
     write_plan,
 )
-from robomme_interference_data.constants import FAMILIES
+from robomme_interference_data.constants import FAMILIES, STATE
 from robomme_interference_data.errors import FormatError, InvalidOptionError
-from robomme_interference_data.ids import parse_numbers
+from robomme_interference_data.ids import EpisodeId, parse_numbers
 from robomme_interference_data.schema.reference_plan import ReferencePlan
+from robomme_interference_data.storage.arrays import FeatureDigests
 
 ROOT = Path(__file__).parents[2]
 LARGEST = 1_000_000
@@ -78,7 +80,7 @@ def test_the_official_plan_is_of_the_benchmark() -> None:
     assert {unit.episode.index for unit in units} == {*parse_numbers(numbers)}
     lessons = [episode for episode in plan.episodes if episode.dataset == "demonstrations"]
     digests = [lesson for lesson in lessons if "observation.images.front" in lesson.digests]
-    assert len(digests) >= 18 and plan.renderers["demonstrations"]
+    assert len(digests) >= 45 and plan.renderers["demonstrations"]
 
 
 def test_units_are_used_about_equally_often() -> None:
@@ -92,16 +94,24 @@ def test_units_are_used_about_equally_often() -> None:
     )
 
 
-@pytest.mark.slow
-def test_recorded_lessons_have_the_digests_of_the_official_plan(shared_data: Path) -> None:
-    """They were recorded on RoboMME's own fork of ManiSkill."""
+def test_recorded_lessons_have_the_states_of_the_official_plan(shared_data: Path) -> None:
+    """They were recorded on another machine, with RoboMME's own fork of ManiSkill.
+
+    Their images are not compared: a few pixels differ where bins are moved.
+    """
     lessons = {episode.episode: episode for episode in read_plan("official").episodes}
-    recorded = [*recorded_lessons(shared_data / "lessons")]
-    assert len(recorded) == 9
-    for lesson in recorded:
-        planned_lesson = lessons[lesson.episode]
-        assert planned_lesson.frames == lesson.frames
-        assert lesson.digests.items() <= planned_lesson.digests.items()
+    compared = 0
+    for path in sorted((shared_data / "lessons").glob("*.npz")):
+        with np.load(path) as arrays:
+            frames = int(arrays["exec_start_idx"])
+            episode = EpisodeId(str(arrays["env_id"]), "test", int(arrays["episode"]))
+            digests = FeatureDigests()
+            digests.update(STATE, arrays["state"][:frames])
+        assert lessons[episode].frames == frames
+        if lessons[episode].digests:
+            assert lessons[episode].digests[STATE] == digests.current()[STATE]
+            compared += 1
+    assert compared == 7
 
 
 # --- a buffer set against a plan ----------------------------------------------------------------
@@ -199,7 +209,10 @@ TAMPERED: dict[str, tuple[Callable[[ReferencePlan], ReferencePlan], dict[str, st
     ),
     "states": (
         lambda plan: other_digest(plan, "observation.state"),
-        {"demonstrations VideoRepick/test/0": "observation.state differs from the plan"},
+        {
+            "demonstrations VideoRepick/test/0": "observation.state differs from the plan, though "
+            "the renderer is the same"
+        },
     ),
     "images of the same renderer": (
         lambda plan: other_digest(plan, "observation.images.front"),
@@ -219,9 +232,11 @@ def test_every_difference_is_reported_once(what: str, plan: ReferencePlan) -> No
     assert len(found) == len(expected)
 
 
-def test_images_of_another_renderer_are_noted_only(plan: ReferencePlan) -> None:
+@pytest.mark.parametrize("feature", ["observation.images.front", "observation.state"])
+def test_digests_of_another_renderer_are_noted_only(feature: str, plan: ReferencePlan) -> None:
+    """States, too: a software renderer is named by its processor, whose maker they depend on."""
     drawn = replace(plan, renderers={"demonstrations": "a GPU", "distractors": None})
-    comparison = compare(plan, other_digest(drawn, "observation.images.front"))
+    comparison = compare(plan, other_digest(drawn, feature))
     [note] = comparison.notes
     assert not comparison.differences and "1 of 3 compared episodes" in note and "a GPU" in note
     without = [replace(episode, digests={}) for episode in plan.episodes]

@@ -83,7 +83,7 @@ def test_what_is_played_otherwise_is_found(
     assert played(lessons, {1}) == ([f"{QUERY}: {what}" for what in expected], [])
 
 
-def test_images_count_on_the_recorded_renderer_only(
+def test_images_and_states_count_on_the_recorded_renderer_only(
     lessons: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Shown, "brighter", 1)
@@ -97,6 +97,7 @@ def test_images_count_on_the_recorded_renderer_only(
     identity = json.loads(path.read_text())
     identity["sources"][0]["renderer"] = "another"
     path.write_text(json.dumps(identity))
+    monkeypatch.setattr(Shown, "state", 0.5)
     assert played(lessons, {1}) == ([], ["demonstrations"])
     identity["sources"][0]["versions"]["tabletop"] = "99"
     path.write_text(json.dumps(identity))

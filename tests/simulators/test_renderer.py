@@ -1,5 +1,6 @@
 """Which device SAPIEN draws on, and its driver."""
 
+import re
 from typing import Any
 
 import pytest
@@ -30,7 +31,7 @@ def summary(*devices: tuple[str, int, int]) -> str:
 @pytest.mark.parametrize(
     ("devices", "renderer"),
     [
-        ([("llvmpipe", 1, -1)], "llvmpipe, driver llvmpipe Mesa 25.0.7, CPU"),
+        ([("llvmpipe", 1, -1)], "llvmpipe, driver llvmpipe Mesa 25.0.7, CPU AuthenticAMD"),
         ([("llvmpipe", 1, -1), ("NVIDIA H200", 1, 0)], "NVIDIA H200, driver NVIDIA 570.86, GPU"),
         # One without graphics, as in a container that was started without them.
         ([("NVIDIA H200", 0, 0), ("Radeon", 1, -1)], "Radeon, driver radv Mesa 25.0.7, GPU"),
@@ -48,14 +49,16 @@ def test_the_device_that_draws(
 
     monkeypatch.setattr(sapien.render, "get_device_summary", lambda: summary(*devices))
     monkeypatch.setattr(sapien_renderer, "vulkan_devices", lambda: DRIVERS)
+    monkeypatch.setattr(sapien_renderer, "_processor", lambda: "AuthenticAMD")
     assert describe_renderer() == renderer
 
 
 def test_the_renderer_of_this_machine(tabletop: Any) -> None:
     found = simulator_renderer("tabletop")
     assert found is not None and ", driver " in found
-    assert found.endswith(("CPU", "GPU"))
-    assert ("llvmpipe" in found) <= found.endswith("CPU")
+    kind = found.rpartition(", ")[2]
+    assert kind == "GPU" or re.fullmatch(r"CPU \w+", kind)
+    assert ("llvmpipe" in found) <= kind.startswith("CPU")
     assert simulator_renderer("support.worlds:World") is None  # which declares none
 
 

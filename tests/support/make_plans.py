@@ -1,21 +1,17 @@
 """Make the reference plans of the package, from what is recorded of their episodes.
 
 `PYTHONPATH=tests python tests/support/make_plans.py official DATASET…` takes the lengths of lessons
-from `docs/results/robomme/lessons.parquet`, and from the given datasets the pool of units and
-digests; what the present plan has of other episodes stays. A folder of recorded lessons, as in
-`../shared/data`, is one more source of digests.
+from `docs/results/robomme/lessons.parquet`, and from the given datasets, which one renderer drew,
+all digests and further units. The units of the present plan stay.
 `… make_plans.py tutorial BUFFER_SET` takes all of a buffer set.
 """
 
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 
-import av
-import numpy as np
 import pyarrow.parquet as pq
 from support.buffer_sets import plan_again
 from support.made_up import record, write_metadata
@@ -30,19 +26,15 @@ from robomme_interference_data.build_dataset.verify.reference import (
 from robomme_interference_data.constants import (
     DEMONSTRATIONS,
     FORMAT_VERSION,
-    FRONT,
-    IDENTITY_PATH,
     OFFICIAL,
     PAPER_UNIT,
     RULE_VERSION,
-    STATE,
 )
 from robomme_interference_data.data.dataset import Dataset
 from robomme_interference_data.data.renderers import dataset_renderers
 from robomme_interference_data.ids import EpisodeId
 from robomme_interference_data.schema.conditions import DEFAULT_CONDITIONS
 from robomme_interference_data.schema.reference_plan import ReferenceEpisode, ReferencePlan
-from robomme_interference_data.storage.arrays import FeatureDigests
 from robomme_interference_data.storage.files import LocalFiles
 
 LESSONS = Path(__file__).parents[2] / "docs" / "results" / "robomme" / "lessons.parquet"
@@ -74,46 +66,26 @@ def planned(plan: ReferencePlan, folder: Path) -> ReferencePlan:
     return replace(made_again, episodes=episodes, renderers=plan.renderers)
 
 
-def recorded_lessons(folder: Path) -> Iterator[ReferenceEpisode]:
-    """Yield the lessons of a folder with what is recorded of them: front images and states."""
-    for path in sorted(folder.glob("*.npz")):
-        with np.load(path) as arrays:
-            lesson = int(arrays["exec_start_idx"])
-            family, index = str(arrays["env_id"]), int(arrays["episode"])
-            digests = FeatureDigests()
-            digests.update(STATE, arrays["state"][:lesson])
-        with av.open(str(path.with_name(f"{path.stem}_front.mkv"))) as video:
-            for frame in islice(video.decode(video=0), lesson):
-                digests.update(FRONT, frame.to_ndarray(format="rgb24"))
-        episode = EpisodeId(family, "test", index)
-        yield ReferenceEpisode(DEMONSTRATIONS, episode, lesson, digests.current())
-
-
-def official(
-    datasets: Iterable[Dataset], recorded: Iterable[ReferenceEpisode], folder: Path
-) -> ReferencePlan:
+def official(datasets: Iterable[Dataset], folder: Path) -> ReferencePlan:
     """Return the plan of the official query episodes."""
     renderers: dict[str, str | None] = {}
     known: dict[tuple[str, EpisodeId], ReferenceEpisode] = {}
     if (PLANS / "official.json").is_file():
-        before = read_plan("official")
-        renderers |= before.renderers
-        known |= {(episode.dataset, episode.episode): episode for episode in before.episodes}
+        for episode in read_plan("official").episodes:
+            known[episode.dataset, episode.episode] = replace(episode, digests={})
+            renderers[episode.dataset] = None
     for row in pq.read_table(LESSONS, columns=["episode_id", "lesson_frames"]).to_pylist():
         key = DEMONSTRATIONS, EpisodeId.parse(row["episode_id"])
         known.setdefault(key, ReferenceEpisode(*key, row["lesson_frames"], {}))
     for dataset in datasets:
         renderer = dataset_renderers({dataset.kind: dataset})[dataset.kind]
-        renderers[dataset.kind] = renderer or renderers.get(dataset.kind)
+        if (renderers.get(dataset.kind) or renderer) != renderer:
+            sys.exit(f"{renderer} drew {dataset.files.location}, another one the datasets before")
+        renderers[dataset.kind] = renderer
         for stored in dataset.records():
             start, stop = stored.session
             key = dataset.kind, stored.episode_id
-            digests = dict(known[key].digests) if key in known else {}
-            digests |= stored.feature_sha256
-            known[key] = ReferenceEpisode(*key, stop - start, digests)
-    for lesson in recorded:
-        key = lesson.dataset, lesson.episode
-        known[key] = replace(lesson, digests=lesson.digests | known[key].digests)
+            known[key] = ReferenceEpisode(*key, stop - start, stored.feature_sha256)
     episodes = tuple(known[key] for key in sorted(known))
     plan = ReferencePlan(
         FORMAT_VERSION,
@@ -133,11 +105,8 @@ if __name__ == "__main__":
     name, *folders = sys.argv[1:]
     if name == "official":
         with tempfile.TemporaryDirectory() as temporary:
-            paths = [Path(folder) for folder in folders]
-            built = [path for path in paths if (path / IDENTITY_PATH).is_file()]
-            opened = [Dataset(LocalFiles(path)) for path in built]
-            recorded = [it for path in paths if path not in built for it in recorded_lessons(path)]
-            plan = official(opened, recorded, Path(temporary))
+            opened = [Dataset(LocalFiles(Path(folder))) for folder in folders]
+            plan = official(opened, Path(temporary))
     else:
         plan = reference_plan(load_buffer_set(folders[0]))
     write_plan(plan, PLANS / f"{name}.json")
