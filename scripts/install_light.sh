@@ -5,7 +5,8 @@
 #     scripts/install_light.sh FOLDER
 set -euo pipefail
 [[ $# == 1 ]] || { echo "usage: scripts/install_light.sh FOLDER" >&2; exit 2; }
-folder=$(realpath -m -- "$1")
+folder=$1
+[[ $folder == /* ]] || folder=$PWD/$folder
 [[ ! -e $folder || -f $folder/pyvenv.cfg ]] || {
   echo "install_light: $folder is no environment, and is kept: give a new folder" >&2
   exit 1

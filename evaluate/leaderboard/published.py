@@ -63,10 +63,20 @@ class Grid:
 
     @classmethod
     def of(cls, entries: Entries, board: Board) -> "Grid | None":
-        """Return that of a board; None if the board names no buffer set."""
+        """Return that of a board; None if the board names no buffer set.
+
+        Raises:
+            FormatError: The board names a repository without its commit: it could change.
+        """
         if board.buffer_set is None:
             return None
-        return cls(load_buffer_set(entries.locate(board.buffer_set)))
+        location = entries.locate(board.buffer_set)
+        if isinstance(location, str) and not _PINNED.fullmatch(location):
+            raise FormatError(
+                f"the buffer_set of the board {board.name} is {location}; expected "
+                "namespace/name@ and the 40 digits of a commit"
+            )
+        return cls(load_buffer_set(location))
 
     def episodes(self, condition: str) -> list[EpisodeId]:
         """Return the query episodes of a condition."""

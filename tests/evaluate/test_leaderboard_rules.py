@@ -12,8 +12,10 @@ from support import boards, runs
 from support.boards import BOARD, Files
 from support.buffer_sets import GOLDEN
 from support.hub_server import HubServer
+from support.messages import raises
 
 from robomme_interference_data.constants import RUN_HEADER, RUN_RECORD
+from robomme_interference_data.errors import FormatError
 from robomme_interference_data.evaluate.leaderboard.checks import few_errors
 from robomme_interference_data.evaluate.leaderboard.entries import read_entries
 from robomme_interference_data.evaluate.leaderboard.published import RATES
@@ -253,6 +255,12 @@ def test_what_is_not_there(
     # What needs no rows is checked at once.
     assert [problem.rule.number for problem in problems] == [9, 10]
     assert part in problems[0].what
+
+
+def test_a_board_names_the_commit_of_its_buffer_set(tmp_path: Path) -> None:
+    board = {"name": BOARD, "simulator": "tabletop", "buffer_set": "someone/set@main"}
+    with raises(FormatError):
+        check_all(read_entries(boards.write_board(tmp_path / "results.yaml", boards=[board])))
 
 
 def test_weights_are_not_empty(published_run: Files, hub: HubServer, tmp_path: Path) -> None:
