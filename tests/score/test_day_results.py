@@ -152,13 +152,28 @@ def test_rollouts() -> None:
     score = made.score(FOLDER / "acted.parquet")
     cells = {(cell.system, cell.condition, cell.part): cell for cell in score.cells if cell.n}
     listed = table(PAGE, "history | MoveCube")
-    assert len(listed) == 4
+    assert len(listed) == 5
     for row in listed:
-        condition, _, retrieval = row.pop("history").partition(", ")
-        system = "retrieval-replay-framesamp-changes" if retrieval else "replay-framesamp"
+        condition, _, rule = row.pop("history").partition(", retrieval ")
+        system = f"retrieval-replay-framesamp-{rule.strip('`')}" if rule else "replay-framesamp"
         for part, text in row.items():
             cell = cells[system, condition.strip("`"), "" if part == "all" else part]
             assert text == f"{cell.counts[0]} of {cell.n}"
+
+
+def test_learner() -> None:
+    rows = pq.read_table(FOLDER / "learned.parquet").to_pylist()
+    assert {row["protocol_version"] for row in rows} == {PROTOCOL_VERSION}
+    seeds = {row["training_seed"] for row in rows}
+    right = Counter((row["system"], row["condition"]) for row in rows if row["success"])
+    asked = Counter((row["system"], row["condition"]) for row in rows)
+    for row in table(PAGE, "trained on | "):
+        system = {"`day-alone`": "learned-alone"}.get(row.pop("trained on"), "learned-stream")
+        for head, text in row.items():
+            condition, _, rule = head.partition(", ")
+            cell = (f"{system}-{rule}" if rule else system, condition.strip("`"))
+            assert asked[cell] == 149 * len(seeds)
+            assert text == f"{100 * right[cell] / asked[cell]:.1f}%"
 
 
 def test_shortcuts() -> None:
