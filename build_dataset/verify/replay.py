@@ -61,9 +61,9 @@ class PlayedDataset:
         source: The simulator.
         cameras: The cameras that it stores.
         unit: Size of its units, as in the distractors.
-        states: Whether states and actions must be equal too: the simulator has the recorded
-            versions and renderer.
-        frames: Whether images must be, too: in addition, they were not changed by a build.
+        states: Whether states and actions must be equal too: the renderer is the recorded one.
+        frames: Whether images must be, too: in addition, versions and options are the recorded
+            ones, and the images were not changed by a build.
     """
 
     name: str
@@ -196,8 +196,9 @@ def plan_replay(
             what = f"sources are {stored}; {simulator} is {source.provenance} here"
             violations.append(Violation(f"{name}/{IDENTITY_PATH}", what))
             continue
-        states = stored == [source.provenance]
-        frames = states and dataset.identity.exact
+        renderer = source.provenance.get("renderer")
+        states = all(entry.get("renderer") == renderer for entry in stored)
+        frames = stored == [source.provenance] and dataset.identity.exact
         played[name] = PlayedDataset(name, source, dataset.cameras, unit, states, frames)
     if not recorded:
         others = sorted(set().union(*kinds.values()))

@@ -283,8 +283,8 @@ def _print_extent(report: dict[str, Any]) -> None:
         print_status(f"Played again: {counted(report['played_again'], 'episode')}.")
     if names := report.get("states_not_compared"):
         print_status(
-            f"States not compared: {', '.join(names)} were recorded with other versions or another "
-            "renderer than those here."
+            f"States not compared: {', '.join(names)} were recorded with another renderer than the "
+            "one here."
         )
     if names := report.get("images_not_compared"):
         print_status(

@@ -152,7 +152,7 @@ def test_rollouts() -> None:
     score = made.score(FOLDER / "acted.parquet")
     cells = {(cell.system, cell.condition, cell.part): cell for cell in score.cells if cell.n}
     listed = table(PAGE, "history | MoveCube")
-    assert len(listed) == 5
+    assert len(listed) == 4
     for row in listed:
         condition, _, rule = row.pop("history").partition(", retrieval ")
         system = f"retrieval-replay-framesamp-{rule.strip('`')}" if rule else "replay-framesamp"
