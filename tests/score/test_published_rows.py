@@ -20,6 +20,7 @@ NO_ROWS = {
     "day/ceilings.csv",
     "day/retrieval.csv",
     "day/shortcuts.csv",
+    "day/spans.csv",
     "robomme/ceilings.csv",
     "robomme/lessons.parquet",
     "robomme/shortcuts.csv",
