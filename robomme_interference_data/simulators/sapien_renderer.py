@@ -12,6 +12,7 @@ import re
 import subprocess
 import sys
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 _SECONDS = 300
@@ -66,10 +67,10 @@ def describe_renderer() -> str:
 def _processor() -> str:
     """Return the maker of the processor, such as `GenuineIntel`, or its architecture."""
     try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            found = re.search(r"^vendor_id\s*: (.+)$", file.read(), re.MULTILINE)
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:
-        found = None
+        text = ""
+    found = re.search(r"^vendor_id\s*: (.+)$", text, re.MULTILINE)
     return found[1] if found else platform.machine()
 
 
