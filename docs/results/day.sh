@@ -16,7 +16,7 @@ if [ "${1:-}" = act ]; then
             --families MoveCube,PatternLock,RouteStick --set cache=true "$@"
     }
     roll --policy replay:framesamp --conditions day-alone,day-k7,day-cut-k7 --out acted/replay
-    for rule in windows3 changes; do
+    for rule in window windows3 changes; do
         roll --policy replay:framesamp --conditions day-k7 --retrieval thumbnail \
             --retrieval-rule $rule --out acted/replay-$rule
     done

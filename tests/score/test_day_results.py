@@ -156,7 +156,7 @@ def test_rollouts() -> None:
     score = made.score(FOLDER / "acted.parquet")
     cells = {(cell.system, cell.condition, cell.part): cell for cell in score.cells if cell.n}
     listed = table(PAGE, "history | MoveCube (17)")
-    assert len(listed) == 4
+    assert len(listed) == 5
     for row in listed:
         condition, _, rule = row.pop("history").partition(", retrieval ")
         system = f"retrieval-replay-framesamp-{rule.strip('`')}" if rule else "replay-framesamp"
@@ -164,6 +164,9 @@ def test_rollouts() -> None:
             part, _, n = head.removesuffix(")").partition(" (")
             cell = cells[system, condition.strip("`"), "" if part == "all" else part]
             assert (text, n) == (str(cell.counts[0]), str(cell.n))
+    # McNemar's exact p of 10 gained and 1 lost, of 7 and 2, of 1 and 1.
+    corrected = holm([24 / 2**11, 92 / 2**9, 1.0])
+    assert f"p = {corrected[0]:.3f} for three rules" in PAGE
 
 
 def test_learner() -> None:
