@@ -1,7 +1,7 @@
 """Collect what day.sh measured: `python docs/results/make_day.py FOLDER` writes day/.
 
-The spans, rollouts and learner of day/ are of a build on a processor of Intel; all else is of an
-earlier one, on another processor. Both have the same plan, lengths and answers.
+The spans, rollouts and learner of day/ are of a second build, on a processor of Intel; all else is
+of an earlier one, on another machine, whose states differ in the last bits.
 """
 
 import csv

@@ -47,8 +47,8 @@ def renderer_in(python: str) -> str | None:
 def describe_renderer() -> str:
     """Return the renderer, such as `NVIDIA H200, driver NVIDIA 570.86, GPU`.
 
-    One that draws in software is also named by the maker of its processor: those of Intel and AMD
-    approximate reciprocals (the instruction RCPPS, which PhysX uses) by other bits.
+    One that draws in software is also named by the maker of its processor: what PhysX computes
+    depends on how a maker approximates reciprocals (the instruction RCPPS).
 
     Raises:
         LookupError: No device can draw.

@@ -1,8 +1,11 @@
 """What docs/results/day.md states is what its rows say, of the versions that the code has."""
 
 import csv
+import re
 from collections import Counter
+from pathlib import Path
 
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 from support import scoring as made
@@ -10,6 +13,7 @@ from support.pages import RESULTS, table
 
 from robomme_interference_data.constants import ABILITIES, PROTOCOL_VERSION
 from robomme_interference_data.schema.days import LEAST_FRAMES
+from robomme_interference_data.stats.intervals import newcombe_paired
 from robomme_interference_data.stats.significance import holm
 
 PAGE = (RESULTS / "day.md").read_text(encoding="utf-8")
@@ -129,6 +133,14 @@ def test_controls(successes: Counter[tuple[str, str]]) -> None:
     ("file", "first", "second", "gained", "lost"),
     [
         ("asked", ("observer-framesamp-32", "day-cut-k7"), ("observer-framesamp-32", LAST), 8, 5),
+        (
+            "asked",
+            ("observer-framesamp-32", LAST),
+            ("observer-framesamp-32-windows3", LAST),
+            20,
+            16,
+        ),
+        ("asked", ("observer-window-60s", LAST), ("observer-window-60s-windows3", LAST), 100, 0),
         ("acted", ("replay-framesamp", "day-alone"), ("replay-framesamp", LAST), 0, 29),
         ("acted", ("replay-framesamp", LAST), ("retrieval-replay-framesamp-changes", LAST), 7, 2),
         ("acted", ("replay-framesamp", LAST), ("retrieval-replay-framesamp-windows3", LAST), 10, 1),
@@ -149,7 +161,9 @@ def test_paired_changes(
     assert before.keys() == after.keys()
     changes = Counter((before[query], after[query]) for query in before)
     assert (changes[False, True], changes[True, False]) == (gained, lost)
-    assert f"{gained} gained, {lost} lost" in PAGE
+    interval = newcombe_paired(changes[True, True], gained, lost, changes[False, False])
+    low, high = (f"{100 * abs(bound):.1f}" for bound in sorted(interval, key=abs))
+    assert re.search(rf"{low} to \+?{high}[^(]*; {gained} gained, {lost} lost", PAGE)
 
 
 def test_rollouts() -> None:
@@ -169,7 +183,7 @@ def test_rollouts() -> None:
     assert f"p = {corrected[0]:.3f} for three rules" in PAGE
 
 
-def test_learner() -> None:
+def test_learner(tmp_path: Path) -> None:
     rows = pq.read_table(FOLDER / "learned.parquet").to_pylist()
     assert {row["protocol_version"] for row in rows} == {PROTOCOL_VERSION}
     seeds = {row["training_seed"] for row in rows}
@@ -187,9 +201,20 @@ def test_learner() -> None:
         (row["condition"], row["ability"] == "absent") for row in alone if row["success"]
     )
     assert (by_ability["day-alone", True], by_ability["day-k0", True]) == (78, 0)
-    shown = [row for row in alone if row["condition"] == "day-alone" and row["ability"] != "absent"]
-    assert f"{100 * by_ability['day-alone', False] / len(shown):.1f}% of those" in PAGE
-    assert f"guessing: {100 * sum(row['chance'] for row in shown) / len(shown):.1f}%" in PAGE
+    table_of_rows = pq.read_table(FOLDER / "learned.parquet")
+    shown = table_of_rows.filter(pc.not_equal(table_of_rows["ability"], "absent"))
+    pq.write_table(shown, tmp_path / "shown.parquet")
+    cells = made.score(tmp_path / "shown.parquet", draws=2000).cells
+    [cell] = [
+        each
+        for each in cells
+        if (each.system, each.condition, each.part) == ("learned-alone", "day-alone", "")
+    ]
+    low, high = (f"{100 * bound:.1f}" for bound in cell.interval)
+    chances = [row["chance"] for row in shown.to_pylist() if row["condition"] == "day-alone"]
+    chance = f"{100 * sum(chances) / len(chances):.1f}%"
+    text = f"{100 * cell.rate:.1f}% of those that have one ({low} to {high}; guessing: {chance})"
+    assert text in PAGE
 
 
 def test_shortcuts() -> None:
