@@ -229,8 +229,10 @@ def _draw_card(
 def _draw_timeline(page: Page, buffer: "Buffer", top: float) -> None:
     """Draw the history to scale, the live observation after it, and the frames of the sample."""
     width = _INNER - _LIVE - 0.42
-    # One frame more, for the live observation.
-    scale = width / (len(buffer) + 1)
+    # One frame more, for the live observation, which alone would fill the line.
+    scale = width / (len(buffer) + 1) if len(buffer) else _MARK
+    end = _MARGIN + width
+    left = end - (len(buffer) + 1) * scale
     caption = "history to scale; ticks: the even sample, and its frames in each session"
     if buffer.evidence:
         caption += "; dark line: shows the answer"
@@ -238,31 +240,31 @@ def _draw_timeline(page: Page, buffer: "Buffer", top: float) -> None:
     bar, sample = top + 0.44, even_sample(len(buffer))
     for number, color in enumerate(session_colors(buffer.sessions)):
         session = buffer.sessions[number]
-        x, wide = _MARGIN + session.start * scale, len(session) * scale
+        x, wide = left + session.start * scale, len(session) * scale
         page.box(x, bar, wide, _BAR, fill=color, edge="white", line=0.5)
         for name in (f"{number} {session.role}", str(number)):  # the first that fits
             if page.text_width(name, _NUMBER, bold=True) < wide:
                 y = bar + _BAR / 2 - 0.05
                 page.text(x + wide / 2, y, name, _NUMBER, bold=True, color=ink_on(color))
                 break
-    mark_evidence(page, buffer, _MARGIN, scale, bar + _BAR)
+    mark_evidence(page, buffer, left, scale, bar + _BAR)
     for index in sample:
-        page.tick(_MARGIN + (index + 0.5) * scale, bar - 0.1, bar - 0.02)
+        page.tick(left + (index + 0.5) * scale, bar - 0.1, bar - 0.02)
     for session in buffer.sessions:
         inside = str(sum(session.start <= index < session.stop for index in sample))
         if page.text_width(inside, _NUMBER, bold=True) < len(session) * scale:
-            x = _MARGIN + (session.start + session.stop) / 2 * scale
+            x = left + (session.start + session.stop) / 2 * scale
             page.text(x, bar - 0.22, inside, _NUMBER, bold=True)
-    end = _MARGIN + width
-    wide = min(scale, _MARK)  # also next to an empty history
-    page.box(end - wide, bar, wide, _BAR, fill="black", edge="black", line=0.8)
+    page.box(end - scale, bar, scale, _BAR, fill="black", edge="black", line=0.8)
     page.text(end + 0.02, bar - 0.21, "+1 live", _NUMBER, align="left", color=_GRAY)
     page.arrow(end + 0.05, end + 0.37, bar + _BAR / 2)
     for index in range(0, len(buffer) + 1, round_step(len(buffer), 10)):
-        x = _MARGIN + (index + 0.5) * scale
+        x = left + (index + 0.5) * scale
         page.tick(x, bar + _BAR, bar + _BAR + 0.04)
         page.text(x, bar + _BAR + 0.06, str(index), _NUMBER, color=_GRAY)
-    page.text(_MARGIN + width / 2, bar + _BAR + 0.19, "frame in the buffer", _TEXT, color=_GRAY)
+    if len(buffer):
+        middle = _MARGIN + width / 2
+        page.text(middle, bar + _BAR + 0.19, "frame in the buffer", _TEXT, color=_GRAY)
     _draw_key(page, buffer, bar + _BAR + 0.36)
 
 
